@@ -1,0 +1,1 @@
+"""Guides: variational families, one file each; none knows a model by name."""

@@ -1,0 +1,62 @@
+"""movezoo: a probabilistic programming model zoo for movement.
+
+Every name below is imported on first use, so that ``import zoo`` costs next to nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from zoo.catalogue import card, list_models
+    from zoo.datasets.library import list_data, load_data
+    from zoo.datasets.records import Pairs, Sequences
+    from zoo.evaluation.table import Table
+    from zoo.prediction import Prediction
+    from zoo.run import Run, create, evaluate, fit, load
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Pairs",
+    "Prediction",
+    "Run",
+    "Sequences",
+    "Table",
+    "__version__",
+    "card",
+    "create",
+    "evaluate",
+    "fit",
+    "list_data",
+    "list_models",
+    "load",
+    "load_data",
+]
+
+_HOME = {
+    "Pairs": "zoo.datasets.records",
+    "Prediction": "zoo.prediction",
+    "Run": "zoo.run",
+    "Sequences": "zoo.datasets.records",
+    "Table": "zoo.evaluation.table",
+    "card": "zoo.catalogue",
+    "create": "zoo.run",
+    "evaluate": "zoo.run",
+    "fit": "zoo.run",
+    "list_data": "zoo.datasets.library",
+    "list_models": "zoo.catalogue",
+    "load": "zoo.run",
+    "load_data": "zoo.datasets.library",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'zoo' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,97 @@
+"""What a model can do: protocols that ``can=`` and the evaluation derive their answers from.
+
+All tensors are in the model's own scale and dtype; the run scales on the way in and out.
+``posterior`` is the guide behind the :class:`~zoo.types.Posterior` protocol, or None for models
+with exact inference. A batch given for prediction holds whole movements of one length, starting
+at frame 0 (``batch.start == 0``); what a forecast has seen is exactly ``batch.values``.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from zoo.prediction import Predictive
+from zoo.types import Batch, Posterior
+
+__all__ = [
+    "Forecasts",
+    "Generates",
+    "Imputes",
+    "Reconstructs",
+    "Regresses",
+    "Represents",
+]
+
+
+@runtime_checkable
+class Regresses(Protocol):
+    """Targets of new inputs."""
+
+    def regress(self, inputs: Float[Tensor, "item feature"], *, draws: int) -> Predictive:
+        """p(y | x, training data), shape (item, target)."""
+        ...
+
+
+@runtime_checkable
+class Represents(Protocol):
+    """Latent trajectories of observed movements."""
+
+    def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """p(z_t | x), shape (sequence, time, latent)."""
+        ...
+
+
+@runtime_checkable
+class Reconstructs(Protocol):
+    """Observed movements through the model."""
+
+    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """p(x̂ | x), shape (sequence, time, channel)."""
+        ...
+
+
+@runtime_checkable
+class Forecasts(Protocol):
+    """The frames after those seen."""
+
+    def forecast(
+        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
+    ) -> Predictive:
+        """p(x_{k+1:k+horizon} | x_{1:k}), shape (sequence, horizon, channel)."""
+        ...
+
+
+@runtime_checkable
+class Imputes(Protocol):
+    """Missing joints, frames or sections: entries that are False in ``batch.mask``."""
+
+    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """p(x_missing | x_seen), shape (sequence, time, channel), all entries."""
+        ...
+
+
+@runtime_checkable
+class Generates(Protocol):
+    """New movements from a demonstration: other goal, other duration, switching."""
+
+    def generate(
+        self,
+        batch: Batch,
+        posterior: Posterior | None,
+        *,
+        goal: Float[Tensor, "sequence channel"] | None,
+        duration: float,
+        onto: Batch | None,
+        start: int,
+        steps: int,
+        draws: int,
+    ) -> Predictive:
+        """Movements like ``batch``: ended at ``goal``, ``duration`` times as long, or switched.
+
+        Switching goes from ``batch`` to the movements ``onto``, from frame ``start`` over
+        ``steps`` frames, (89).
+        """
+        ...

@@ -1,0 +1,1 @@
+"""Dynamics as pure functions of tensors."""

@@ -1,0 +1,47 @@
+"""Errors that say what a model, a prediction or a file honestly cannot give."""
+
+__all__ = [
+    "DamagedRunError",
+    "NoDensityError",
+    "NoJointSamplesError",
+    "NoSpreadError",
+    "NotCapableError",
+    "NotFittedError",
+    "TrainingError",
+    "UnknownNameError",
+]
+
+
+class UnknownNameError(KeyError, ValueError):
+    """A name that nothing is registered under; the message lists the nearest ones."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class NotCapableError(TypeError):
+    """A task that the chosen model has no honest answer to."""
+
+
+class NotFittedError(RuntimeError):
+    """A prediction was asked of a model that has not been trained."""
+
+
+class NoSpreadError(ValueError):
+    """A spread was asked of a deterministic prediction."""
+
+
+class NoDensityError(ValueError):
+    """A density was asked of a prediction that is only known by its quantiles."""
+
+
+class NoJointSamplesError(ValueError):
+    """Joint trajectories were asked of a prediction that only knows its marginals."""
+
+
+class DamagedRunError(ValueError):
+    """A run folder or file that is damaged, foreign, or of an unknown format version."""
+
+
+class TrainingError(RuntimeError):
+    """Training failed for good; the message names site and step and what to try."""

@@ -1,0 +1,1 @@
+"""The evaluation harness: scores, calibration and plots of predictions."""

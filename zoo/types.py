@@ -1,0 +1,116 @@
+"""Names of the tensor axes and the two records that models and the harness exchange.
+
+Axes used in every shape annotation of the package:
+
+=============  ==========================================================
+``sequence``   one movement (a trial, a demonstration)
+``frame``      a time step of a complete movement
+``window``     a sub-sequence cut from a movement; an item of a minibatch
+``time``       a time step of a window
+``channel``    an observed quantity (a joint angle in rad, a pixel, ...)
+``latent``     a dimension of the latent space
+``item``       a row of a regression data set
+``feature``    an input of a regression data set
+``target``     an output of a regression data set
+``sample``     a draw of the Monte Carlo approximation
+``component``  a component of a predictive mixture
+=============  ==========================================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Protocol, Self
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = ["Batch", "Layout", "Posterior"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """What a model must know of its data before it sees any: names, units, rate and lengths."""
+
+    kind: Literal["sequences", "pairs"]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    inputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    rate: float | None = None
+    frames: int | None = None
+
+    def check(self, other: Layout) -> None:
+        """Raise a ValueError that names the first difference that matters for prediction."""
+        if self.kind != other.kind:
+            raise ValueError(f"data are {other.kind}; this model was made for {self.kind}")
+        for what in ("channels", "inputs"):
+            mine, theirs = getattr(self, what), getattr(other, what)
+            if len(mine) != len(theirs):
+                raise ValueError(
+                    f"data have {len(theirs)} {what}; this model was made for "
+                    f"{len(mine)} ({', '.join(mine[:3])}, …)"
+                )
+            if mine != theirs:
+                i = next(i for i, (a, b) in enumerate(zip(mine, theirs, strict=True)) if a != b)
+                raise ValueError(
+                    f"{what} {i} of the data is {theirs[i]!r}; this model was made for {mine[i]!r}"
+                )
+        if self.units != other.units:
+            raise ValueError(f"data are in {other.units}; this model was made for {self.units}")
+        if self.rate and other.rate and abs(self.rate - other.rate) > 1e-6 * self.rate:
+            raise ValueError(
+                f"data run at {other.rate:g} Hz; this model was made for {self.rate:g} Hz"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """A minibatch: windows of movements with the complete movements they were cut from.
+
+    For regression data ``values`` are the targets, ``inputs`` the features, ``time`` is absent
+    and ``movements`` is empty. Missing entries are 0 in ``values`` and False in ``mask``;
+    ``mask`` is None where nothing is missing. ``total`` and ``total_sequences`` count the whole
+    training set, so that a plate of that size scales a minibatch rightly.
+    """
+
+    values: Float[Tensor, "window time channel"]
+    mask: Bool[Tensor, "window time channel"] | None
+    inputs: Float[Tensor, "window time control"] | None
+    start: Int[Tensor, " window"]
+    sequence: Int[Tensor, " window"]
+    movements: Float[Tensor, "sequence frame channel"]
+    movement_mask: Bool[Tensor, "sequence frame channel"] | None
+    total: int
+    total_sequences: int
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return int(self.values.shape[0])
+
+    def repeat(self, times: int) -> Self:
+        """Every window ``times`` times over, the copies of the whole batch one after the other."""
+        tiled: dict[str, Any] = {
+            f.name: torch.cat([getattr(self, f.name)] * times)
+            for f in fields(self)
+            if f.name in ("values", "mask", "inputs", "start", "sequence")
+            and getattr(self, f.name) is not None
+        }
+        return replace(self, **tiled)
+
+
+class Posterior(Protocol):
+    """What a model may ask of its guide when it predicts; the model never sees the guide."""
+
+    def draw(self, batch: Batch, draws: int) -> dict[str, Tensor]:
+        """Joint draws of every latent site, each with a leading ``sample`` axis."""
+        ...
+
+    def encode(
+        self,
+        values: Float[Tensor, "*batch channel"],
+        mask: Bool[Tensor, "*batch channel"] | None = None,
+    ) -> torch.distributions.Normal:
+        """q(z_t | x_t) of single frames."""
+        ...
