@@ -1,0 +1,1 @@
+"""Measurements against named peers; each command writes JSON under ``results/``."""
