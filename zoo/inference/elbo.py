@@ -1,0 +1,200 @@
+"""The evidence lower bound of one pass through guide and model, with its terms kept apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import pyro
+import torch
+from pyro import poutine
+from pyro.distributions.util import scale_and_mask
+from pyro.infer.enum import get_importance_trace
+from pyro.poutine.messenger import Messenger
+from pyro.poutine.subsample_messenger import _Subsample
+from torch import Tensor, nn
+
+from zoo.types import Batch
+
+__all__ = [
+    "Bound",
+    "Program",
+    "Site",
+    "Sites",
+    "bound",
+    "check",
+    "divergences",
+    "sites",
+    "tight_bound",
+]
+
+Program = nn.Module | Callable[[Batch], Any]
+Site = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Sites:
+    """Sample sites of one pass: of the model given the guide's draws, and of the guide."""
+
+    model: dict[str, Site]
+    guide: dict[str, Site]
+
+
+@dataclass(frozen=True)
+class Bound:
+    r"""One draw of the bound on log p(x), summed over the whole training set.
+
+    ``loss = −[c log p(x|z) − β (log q(z) − c log p(z))]`` is what training minimises, (87);
+    ``reconstruction = Σ log p(x|z)`` and ``kl = Σ log q(z) − log p(z)`` are free of c and β.
+    ``terms`` holds the log densities of every site, by name, as ``p(name)`` and ``q(name)``;
+    the closed-form KL of a site is ``kl(name)``.
+    """
+
+    loss: Tensor
+    reconstruction: Tensor
+    kl: Tensor
+    terms: dict[str, Tensor]
+
+    @property
+    def elbo(self) -> Tensor:
+        """The plain bound, c = β = 1."""
+        return self.reconstruction - self.kl
+
+    def broken(self) -> list[str]:
+        """Terms that are not finite, the model's first."""
+        return [name for name, value in self.terms.items() if not math.isfinite(value.item())]
+
+
+def bound(
+    model: Program, guide: Program, batch: Batch, *, c: float = 1.0, beta: float = 1.0
+) -> Bound:
+    """One reparameterised draw of the bound; the model's log densities are scaled by ``c``."""
+    drawn = sites(model, guide, batch, c=c)
+    terms: dict[str, Tensor] = {}
+    observed: list[Tensor] = []
+    latent: list[Tensor] = []
+    for name, site in drawn.model.items():
+        log_p = terms[f"p({name})"] = log_density(site)
+        (observed if site["is_observed"] else latent).append(log_p)
+    for name, site in drawn.guide.items():
+        terms[f"q({name})"] = log_density(site)
+    log_q = _total([terms[f"q({name})"] for name in drawn.guide])
+    likelihood, prior = _total(observed), _total(latent)
+    reconstruction, divergence = likelihood, log_q - prior
+    loss = beta * divergence - reconstruction
+    if c != 1.0:
+        reconstruction, divergence = likelihood / c, log_q - prior / c
+    return Bound(loss, _detach(reconstruction), _detach(divergence), terms)
+
+
+def tight_bound(model: Program, guide: Program, batch: Batch) -> Bound:
+    """The plain bound with every KL in closed form where one is known: less Monte Carlo noise.
+
+    A site whose KL is not known, or whose parents in the model may come later in the guide, keeps
+    its sampled log q − log p.
+    """
+    drawn = sites(model, guide, batch)
+    terms = {f"p({n})": log_density(s) for n, s in drawn.model.items() if s["is_observed"]}
+    reconstruction = _total(list(terms.values()))
+    kls = {f"kl({name})": kl for name, kl in divergences(drawn).items()}
+    kl = _total(list(kls.values()))
+    return Bound(kl - reconstruction, _detach(reconstruction), _detach(kl), terms | kls)
+
+
+def divergences(drawn: Sites) -> dict[str, Tensor]:
+    """KL(q ‖ p) of every latent site, in closed form where that is known and right."""
+    latent = [name for name, site in drawn.model.items() if not site["is_observed"]]
+    same_order = latent == [name for name in drawn.guide if name in drawn.model]
+    shared = {
+        name: _divergence(drawn.guide[name], drawn.model[name], closed=same_order)
+        for name in latent
+    }
+    return shared | {n: log_density(s) for n, s in drawn.guide.items() if n not in drawn.model}
+
+
+def sites(model: Program, guide: Program, batch: Batch, *, c: float = 1.0) -> Sites:
+    """Run the guide, then the model on the guide's draws."""
+    with _Record() as posterior:
+        guide(batch)
+    tempered = nullcontext() if c == 1.0 else poutine.scale(scale=c)
+    with _Record(given=posterior.seen) as joint, tempered:
+        model(batch)
+    return Sites(joint.real, posterior.real)
+
+
+def check(model: Program, guide: Program, batch: Batch) -> None:
+    """One pass with every check of Pyro, and the checks of this estimator, by name of the site."""
+    with torch.no_grad(), pyro.validation_enabled(True):
+        drawn = sites(model, guide, batch)
+        _check_match(drawn)
+        get_importance_trace("flat", math.inf, model, guide, (batch,), {})
+
+
+def log_density(site: Site) -> Tensor:
+    """Log density of a site with its mask and its scale, summed."""
+    log_p: Tensor = site["fn"].log_prob(site["value"], *site["args"], **site["kwargs"])
+    if site["mask"] is None:
+        total = log_p.sum()
+        return total if site["scale"] == 1.0 else total.mul(site["scale"])
+    total = scale_and_mask(log_p, scale=site["scale"], mask=site["mask"]).sum()
+    return total
+
+
+class _Record(Messenger):
+    """Keep every sample site; take the values of those that are ``given``."""
+
+    def __init__(self, given: dict[str, Site] | None = None) -> None:
+        super().__init__()
+        self.given = {} if given is None else given
+        self.seen: dict[str, Site] = {}
+
+    @property
+    def real(self) -> dict[str, Site]:
+        """The sites without the subsamples of plates."""
+        return {n: s for n, s in self.seen.items() if not isinstance(s["fn"], _Subsample)}
+
+    def _pyro_sample(self, message: Site) -> None:
+        if message["name"] in self.given and not message["is_observed"]:
+            message["value"], message["done"] = self.given[message["name"]]["value"], True
+
+    def _pyro_post_sample(self, message: Site) -> None:
+        self.seen[message["name"]] = message
+
+
+def _divergence(q: Site, p: Site, *, closed: bool) -> Tensor:
+    if closed:
+        try:
+            kl = torch.distributions.kl_divergence(q["fn"], p["fn"])
+        except NotImplementedError:
+            pass
+        else:
+            full = kl.expand(q["fn"].batch_shape)
+            scaled: Tensor = scale_and_mask(full, scale=q["scale"], mask=q["mask"]).sum()
+            return scaled
+    return log_density(q) - log_density(p)
+
+
+def _check_match(drawn: Sites) -> None:
+    latent = {name for name, site in drawn.model.items() if not site["is_observed"]}
+    if missing := sorted(latent - set(drawn.guide)):
+        raise ValueError(f"the guide has no site for {', '.join(missing)} of the model")
+    drawn_only = {n for n, s in drawn.guide.items() if not s["infer"].get("is_auxiliary")}
+    if extra := sorted(drawn_only - latent):
+        raise ValueError(f"the model has no latent site for {', '.join(extra)} of the guide")
+    for name, site in drawn.guide.items():
+        if not site["fn"].has_rsample:
+            raise ValueError(
+                f"site {name!r} of the guide is {type(site['fn']).__name__}, which has no "
+                "reparameterised draws; this bound needs them at every latent site"
+            )
+
+
+def _total(terms: list[Tensor]) -> Tensor:
+    return sum(terms[1:], terms[0]) if terms else torch.zeros(())
+
+
+def _detach(value: Tensor) -> Tensor:
+    return value.detach()
