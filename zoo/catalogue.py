@@ -7,7 +7,20 @@ from zoo.strategies import Exact, MarginalLikelihood, Svi
 
 __all__ = ["CATALOGUE", "list_models"]
 
-CATALOGUE = Registry([])
+CATALOGUE = Registry(
+    [
+        Entry(
+            name="pca",
+            summary="Probabilistic principal components of single frames, exact",
+            thesis="§4.3.2, Table 2",
+            model="zoo.models.pca:PCA",
+            guide="zoo.guides.exact:ExactPosterior",
+            inference=Exact(),
+            data="sequences",
+            dataset="thesis-movements",
+        ),
+    ]
+)
 
 
 def list_models(pattern: str = "*", *, can: str | None = None) -> list[str]:
