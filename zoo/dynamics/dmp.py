@@ -212,11 +212,13 @@ def discrete_basis(
     duration: float,
     decay: float = DECAY,
     spread: float = SPREAD,
+    normalised: bool = True,
 ) -> Float[Tensor, "*time kernel"]:
-    """Normalised Ψ_i(s)/ΣΨ of the discrete system (56) at any times, in units of ``duration``.
+    """Ψ_i(s)/ΣΨ of the discrete system (56) at any times, in units of ``duration``.
 
     Centres are equally spaced in time from 0 to ``duration``; σ_i is ``spread`` times the distance
-    to the next centre in s. Rows sum to one, also far outside of the movement.
+    to the next centre in s. Rows sum to one, also far outside of the movement; Ψ_i alone comes
+    with ``normalised=False``.
 
     >>> discrete_basis(torch.arange(70.0), kernels=20, duration=69).shape
     torch.Size([70, 20])
@@ -227,7 +229,8 @@ def discrete_basis(
     gap = (centre[:-1] - centre[1:]) * spread
     width = torch.cat([gap, gap[-1:]])
     s = phase(time, duration=duration, decay=decay)
-    return torch.softmax(-0.5 * ((s[..., None] - centre) / width).square(), dim=-1)
+    exponent = -0.5 * ((s[..., None] - centre) / width).square()
+    return exponent.softmax(dim=-1) if normalised else exponent.exp()
 
 
 def rhythmic_basis(
@@ -237,11 +240,12 @@ def rhythmic_basis(
     period: float,
     offset: float = 0.0,
     spread: float = SPREAD,
+    normalised: bool = True,
 ) -> Float[Tensor, "*time kernel"]:
-    """Normalised Ψ_i(s)/ΣΨ of the rhythmic system (57), (58); s grows by 2π in a ``period``.
+    """Ψ_i(s)/ΣΨ of the rhythmic system (57), (58); s grows by 2π in a ``period``.
 
     Centres are equally spaced on the circle, h = 1/(``spread`` × distance)²; ``offset`` in rad is
-    the phase at time 0.
+    the phase at time 0; Ψ_i alone comes with ``normalised=False``.
 
     >>> rows = rhythmic_basis(torch.tensor([0.0, 30.0, 60.0]), kernels=8, period=30)
     >>> bool((rows[0] - rows[2]).abs().max() < 1e-5)
@@ -251,7 +255,8 @@ def rhythmic_basis(
     gap = 2 * math.pi / kernels
     centre = gap * torch.arange(kernels, dtype=time.dtype, device=time.device)
     s = 2 * math.pi * time / period + offset
-    return torch.softmax((torch.cos(s[..., None] - centre) - 1) / (spread * gap) ** 2, dim=-1)
+    exponent = (torch.cos(s[..., None] - centre) - 1) / (spread * gap) ** 2
+    return exponent.softmax(dim=-1) if normalised else exponent.exp()
 
 
 def _check_kernels(kernels: int) -> None:
