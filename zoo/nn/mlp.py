@@ -8,7 +8,7 @@ from typing import Literal
 
 from torch import nn
 
-__all__ = ["Activation", "activations", "mlp", "trunk"]
+__all__ = ["Activation", "activations", "mlp", "trunk", "widths"]
 
 Activation = Literal["elu", "gelu", "relu", "sigmoid", "silu", "softplus", "tanh"]
 
@@ -53,6 +53,18 @@ def mlp(sizes: Sequence[int], activation: Activation = "relu") -> nn.Sequential:
     """
     _check(sizes, 2)
     return nn.Sequential(*trunk(sizes[:-1], activation), nn.Linear(sizes[-2], sizes[-1]))
+
+
+def widths(hidden: int | Sequence[int]) -> tuple[int, ...]:
+    """Sizes of the hidden layers from a setting: one number is one layer, () is none.
+
+    >>> widths(200), widths([36, 20]), widths(())
+    ((200,), (36, 20), ())
+    """
+    sizes = (hidden,) if isinstance(hidden, int) else tuple(hidden)
+    if any(size < 1 for size in sizes):
+        raise ValueError(f"hidden layers must have at least 1 unit each; got {sizes}")
+    return sizes
 
 
 def _check(sizes: Sequence[int], least: int) -> None:

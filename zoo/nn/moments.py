@@ -1,11 +1,18 @@
-"""Network heads that give the moments of a Gaussian."""
+"""Networks that give the moments of a Gaussian."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-__all__ = ["ConstantNoiseHead", "GaussianHead"]
+from zoo.nn.mlp import Activation, trunk
+
+__all__ = ["ConstantNoiseHead", "GaussianHead", "GaussianNetwork", "Noise"]
+
+Noise = Literal["state", "constant", "shared"]
 
 
 class GaussianHead(nn.Module):
@@ -39,7 +46,9 @@ class GaussianHead(nn.Module):
 
 
 class ConstantNoiseHead(nn.Module):
-    """Mean from the features and one constant standard deviation a coordinate, σ = s² + floor.
+    """Mean from the features and constant standard deviations σ = s² + floor.
+
+    One σ a coordinate, or one for all where ``shared``.
 
     >>> import torch
     >>> mean, std = ConstantNoiseHead(8, 3)(torch.randn(4, 8))
@@ -48,13 +57,20 @@ class ConstantNoiseHead(nn.Module):
     """
 
     def __init__(
-        self, inputs: int, outputs: int, *, floor: float = 1e-3, initial: float = 1.0
+        self,
+        inputs: int,
+        outputs: int,
+        *,
+        shared: bool = False,
+        floor: float = 1e-3,
+        initial: float = 1.0,
     ) -> None:
         """Head from ``inputs`` features to ``outputs`` coordinates."""
         super().__init__()
         self.floor = floor
         self.mean = nn.Linear(inputs, outputs)
-        self.root = nn.Parameter(self.mean.bias.detach().new_full((outputs,), initial**0.5))
+        start = self.mean.bias.detach().new_full((1 if shared else outputs,), initial**0.5)
+        self.root = nn.Parameter(start)
 
     def forward(
         self, features: Float[Tensor, "*batch feature"]
@@ -62,3 +78,46 @@ class ConstantNoiseHead(nn.Module):
         """Mean and standard deviation."""
         mean = self.mean(features)
         return mean, (self.root.square() + self.floor).expand_as(mean)
+
+
+class GaussianNetwork(nn.Module):
+    """Hidden layers and a head: p(y | x) = N(y; μ(x), σ²), (30).
+
+    ``noise`` says what σ depends on: the ``state`` x, a ``constant`` of each output, or one
+    constant ``shared`` by all. Without hidden layers μ is linear in x.
+
+    >>> import torch
+    >>> mean, std = GaussianNetwork(5, (512,), 50, noise="shared")(torch.randn(8, 70, 5))
+    >>> mean.shape, std.unique().numel()
+    (torch.Size([8, 70, 50]), 1)
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden: Sequence[int],
+        outputs: int,
+        *,
+        activation: Activation = "relu",
+        noise: Noise = "state",
+        floor: float = 1e-3,
+        initial: float = 1.0,
+    ) -> None:
+        """A network from ``inputs`` over the ``hidden`` layers to the moments of ``outputs``."""
+        super().__init__()
+        sizes = [inputs, *hidden]
+        self.trunk = trunk(sizes, activation)
+        self.head: nn.Module
+        if noise == "state":
+            self.head = GaussianHead(sizes[-1], outputs, floor=floor, initial=initial)
+        else:
+            self.head = ConstantNoiseHead(
+                sizes[-1], outputs, shared=noise == "shared", floor=floor, initial=initial
+            )
+
+    def forward(
+        self, x: Float[Tensor, "*batch input"]
+    ) -> tuple[Float[Tensor, "*batch output"], Float[Tensor, "*batch output"]]:
+        """Mean and standard deviation."""
+        moments: tuple[Tensor, Tensor] = self.head(self.trunk(x))
+        return moments
