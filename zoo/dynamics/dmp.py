@@ -17,6 +17,7 @@ from functools import lru_cache
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 __all__ = [
     "Response",
@@ -33,7 +34,7 @@ __all__ = [
 DECAY = math.log(100.0)
 SPREAD = 0.55
 DENSE = 300
-BLOCK = 64
+BLOCK = 32
 
 
 @dataclass(frozen=True)
@@ -119,8 +120,9 @@ def impulse_response(
 class Response:
     """All states of the transformation system in one product: the linear response of (75).
 
-    Up to 300 states are one time-major product; beyond, blocks of 64 steps hand the last state
-    on. Differentiable in every argument. Get one from :meth:`of`, which keeps them.
+    Up to 300 states are one time-major product; beyond, one product carries the states at the
+    begins of blocks of 32 steps and a batched one fills the blocks. Differentiable in every
+    argument. Get one from :meth:`of`, which keeps them.
 
     >>> response = Response.of(Transformation(), 50, torch.float64, "cpu")
     >>> still, goal = torch.zeros(1, 2, dtype=torch.float64), torch.ones(1, 2, dtype=torch.float64)
@@ -136,12 +138,18 @@ class Response:
         if steps < 2:
             raise ValueError(f"steps must be at least 2; got {steps}")
         self.system, self.steps = system, steps
-        self.block = steps - 1 if steps <= DENSE else BLOCK
-        free, forced = impulse_response(transition_matrix(system), input_vector(system), self.block)
-        begin = torch.zeros(2, 1, self.block, dtype=torch.float64)
-        later = torch.stack([_toeplitz(forced[:, 0]), _toeplitz(forced[:, 1])])
-        matrix = torch.cat([free.movedim(0, 1), torch.cat([begin, later], dim=1)], dim=2)
-        self.matrix: Float[Tensor, "2 block_plus_1 block_plus_2"] = matrix.to(device, dtype)
+        self.block = steps if steps <= DENSE else BLOCK
+        self.blocks = math.ceil(steps / self.block)
+        transition, inputs = transition_matrix(system), input_vector(system)
+        free, forced = impulse_response(transition, inputs, self.block)
+        matrix = torch.cat([free[:-1].movedim(0, 1), _lagged(forced)], dim=2)
+        ends = forced.flip(0).mT
+        powers, _ = impulse_response(free[-1], inputs, self.blocks)
+        carry = torch.stack([_toeplitz(p) for p in powers[:-1].flatten(1).mT])
+        carry = carry.unflatten(0, (2, 2)).permute(2, 0, 3, 1).flatten(2).flatten(0, 1)
+        self.matrix: Float[Tensor, "2 block block_plus_2"] = matrix.to(device, dtype)
+        self.ends: Float[Tensor, "2 block"] = ends.to(device, dtype)
+        self.carry: Float[Tensor, "2*blocks 2*blocks"] = carry.to(device, dtype)
 
     @staticmethod
     @lru_cache(maxsize=64)
@@ -180,18 +188,17 @@ class Response:
         self, start: Float[Tensor, "2 column"], force: Float[Tensor, "time_minus_1 column"]
     ) -> Float[Tensor, "2 time column"]:
         """Time-major form of :meth:`states`: ``force`` is αβ g + f + ε, columns are independent."""
-        if self.block == self.steps - 1:
-            return self._block(start, force)
-        parts = [start[:, None]]
-        for piece in force.split(self.block):
-            parts.append(self._block(parts[-1][:, -1], piece)[:, 1:])
-        return torch.cat(parts, dim=1)
-
-    def _block(self, start: Tensor, force: Tensor) -> Tensor:
-        steps = len(force)
-        matrix = self.matrix[:, : steps + 1, : steps + 2]
-        out = matrix.reshape(2 * (steps + 1), -1) @ torch.cat([start, force])
-        return out.view(2, steps + 1, -1)
+        if self.blocks == 1:
+            matrix = self.matrix[:, :, :-1].flatten(0, 1)
+            dense = matrix @ torch.cat([start, force])
+            return dense.view(2, self.steps, -1)
+        short = self.blocks * self.block - len(force)
+        pieces = pad(force, (0, 0, 0, short)).unflatten(0, (self.blocks, -1))
+        jumps = torch.cat([start[None], (self.ends @ pieces)[:-1]])
+        begins = (self.carry @ jumps.flatten(0, 1)).unflatten(0, (-1, 2))
+        path = self.matrix.flatten(0, 1) @ torch.cat([begins, pieces], dim=1)
+        path = path.view(self.blocks, 2, self.block, -1).movedim(1, 0)
+        return path.flatten(1, 2)[:, : self.steps]
 
 
 def phase(
@@ -230,7 +237,7 @@ def discrete_basis(
     width = torch.cat([gap, gap[-1:]])
     s = phase(time, duration=duration, decay=decay)
     exponent = -0.5 * ((s[..., None] - centre) / width).square()
-    return exponent.softmax(dim=-1) if normalised else exponent.exp()
+    return _normalised(exponent) if normalised else exponent.exp()
 
 
 def rhythmic_basis(
@@ -256,12 +263,23 @@ def rhythmic_basis(
     centre = gap * torch.arange(kernels, dtype=time.dtype, device=time.device)
     s = 2 * math.pi * time / period + offset
     exponent = (torch.cos(s[..., None] - centre) - 1) / (spread * gap) ** 2
-    return exponent.softmax(dim=-1) if normalised else exponent.exp()
+    return _normalised(exponent) if normalised else exponent.exp()
 
 
 def _check_kernels(kernels: int) -> None:
     if kernels < 2:
         raise ValueError(f"kernels must be at least 2; got {kernels}")
+
+
+def _normalised(exponent: Float[Tensor, "*time kernel"]) -> Float[Tensor, "*time kernel"]:
+    # the largest exponent is taken out; several times faster than torch.softmax in float64
+    psi = (exponent - exponent.amax(dim=-1, keepdim=True)).exp()
+    return psi / psi.sum(dim=-1, keepdim=True)
+
+
+def _lagged(forced: Float[Tensor, "time 2"]) -> Float[Tensor, "2 time time"]:
+    later = torch.cat([forced.new_zeros(1, 2), forced[:-1]])
+    return torch.stack([_toeplitz(later[:, 0]), _toeplitz(later[:, 1])])
 
 
 def _toeplitz(response: Float[Tensor, " time"]) -> Float[Tensor, "time time"]:

@@ -10,6 +10,7 @@ from zoo.dynamics.dmp import Response, Transformation, input_vector, transition_
 
 __all__ = [
     "central_target_force",
+    "fit_matrix",
     "locally_weighted_regression",
     "ridge_regression",
     "stationary_variance",
@@ -89,6 +90,23 @@ def ridge_regression(
     return torch.cholesky_solve(design.mT @ target, torch.linalg.cholesky(gram))
 
 
+def fit_matrix(
+    design: Float[Tensor, "time kernel"], system: Transformation, penalty: float = 0.0
+) -> Float[Tensor, "kernel time"]:
+    """S with w = S y: ridge regression on the central target force of a movement y.
+
+    Both are linear in the demonstration; the goal is its last frame. Fitting any number of
+    movements of this length is one product.
+    """
+    pull = torch.func.vjp(
+        lambda y: central_target_force(y, y[-1], system), torch.zeros_like(design)
+    )[1]
+    gram = design.mT @ design
+    if penalty:
+        gram = gram + penalty * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
+    return torch.cholesky_solve(pull(design)[0].mT, torch.linalg.cholesky(gram))
+
+
 def trajectory_matrix(
     response: Response, basis: Float[Tensor, "time_minus_1 kernel"]
 ) -> Float[Tensor, "time parameter"]:
@@ -110,8 +128,9 @@ def stationary_variance(system: Transformation) -> float:
 def _force(
     position: Tensor, velocity: Tensor, acceleration: Tensor, goal: Tensor, system: Transformation
 ) -> Tensor:
-    spring = system.beta * (goal[..., None, :] - position)
-    return system.tau**2 * acceleration - system.alpha * (spring - system.tau * velocity)
+    spring = system.stiffness * (goal[..., None, :] - position)
+    damping = system.alpha * system.tau
+    return system.tau**2 * acceleration - spring + damping * velocity
 
 
 def _central(values: Tensor, dt: float) -> Tensor:
