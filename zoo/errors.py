@@ -5,9 +5,12 @@ __all__ = [
     "NoDensityError",
     "NoJointSamplesError",
     "NoSpreadError",
+    "NoiseDivergenceWarning",
     "NotCapableError",
     "NotFittedError",
+    "PosteriorCollapseWarning",
     "TrainingError",
+    "TrainingWarning",
     "UnknownNameError",
 ]
 
@@ -45,3 +48,15 @@ class DamagedRunError(ValueError):
 
 class TrainingError(RuntimeError):
     """Training failed for good; the message names site and step and what to try."""
+
+
+class NoiseDivergenceWarning(UserWarning):
+    """Two sparse approximations of one Gaussian process disagree on the noise."""
+
+
+class TrainingWarning(UserWarning):
+    """Training met a loss or gradient that is not finite and went back to its last good state."""
+
+
+class PosteriorCollapseWarning(UserWarning):
+    """Latent dimensions carry nothing: their posterior is the prior."""

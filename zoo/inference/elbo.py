@@ -136,11 +136,12 @@ def check(model: Program, guide: Program, batch: Batch) -> None:
 def log_density(site: Site) -> Tensor:
     """Log density of a site with its mask and its scale, summed."""
     log_p: Tensor = site["fn"].log_prob(site["value"], *site["args"], **site["kwargs"])
-    if site["mask"] is None:
-        total = log_p.sum()
-        return total if site["scale"] == 1.0 else total.mul(site["scale"])
-    total = scale_and_mask(log_p, scale=site["scale"], mask=site["mask"]).sum()
-    return total
+    scale, mask = site["scale"], site["mask"]
+    if mask is not None:
+        log_p = scale_and_mask(log_p, scale=scale, mask=mask)
+    elif scale != 1.0:
+        return log_p.sum().mul(scale)
+    return log_p.sum()
 
 
 class _Record(Messenger):

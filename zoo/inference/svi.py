@@ -1,0 +1,313 @@
+"""Minibatch stochastic variational inference: the same bits whether interrupted or not."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
+
+import pyro
+import torch
+from torch import Tensor, nn
+
+from zoo.datasets.records import Pairs, Sequences
+from zoo.errors import TrainingError, TrainingWarning
+from zoo.inference import checkpoint
+from zoo.inference.collapse import warn_of_collapse
+from zoo.inference.elbo import Bound, bound, check, tight_bound
+from zoo.inference.history import History, Log, Row
+from zoo.inference.loader import Loader, stream
+from zoo.inference.progress import TrainingBar
+from zoo.inference.state import FIGURES, Best, Parts, Place, State, fingerprint
+from zoo.inference.tempering import learning_rate, ramp
+from zoo.strategies import Svi
+from zoo.types import Batch
+
+__all__ = ["fit_svi"]
+
+TRIES = 6
+SETTLED = 200
+
+
+def fit_svi(
+    model: nn.Module,
+    guide: nn.Module,
+    train: Sequences | Pairs,
+    strategy: Svi,
+    *,
+    val: Sequences | Pairs | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    folder: Path | str | None = None,
+    resume: Literal["never", "auto", "must"] = "never",
+    progress: bool = False,
+    tensorboard: bool = False,
+    on_epoch: Callable[[Row], None] | None = None,
+    checkpoint_seconds: float = 60.0,
+) -> History:
+    """Train ``model`` and ``guide`` in place on scaled data of the model's dtype.
+
+    The noise of a step depends on the seed and the step alone, and the order of the data on the
+    seed and the epoch: a training that was killed at any moment and resumed from ``folder`` ends
+    in the same bits as one that was not. A checkpoint is written every
+    ``strategy.checkpoint_every`` epochs and every ``checkpoint_seconds``. With ``val`` the state
+    of the best un-tempered validation bound is restored; only epochs with c = β = 1 count.
+
+    Raises TrainingError where the loss stays non-finite however small the step, DamagedRunError
+    for a checkpoint that is damaged or of another training, and FileNotFoundError where
+    ``resume="must"`` finds none.
+    """
+    place = None if folder is None else Path(folder)
+    with ExitStack() as scope:
+        scope.enter_context(torch.random.fork_rng(devices=_accelerators(device)))
+        log = scope.enter_context(Log(place, tensorboard=tensorboard))
+        training = _Training(model, guide, train, strategy, val, seed, device)
+        training.keep_in(place, log, checkpoint_seconds)
+        training.begin(resume)
+        scope.enter_context(pyro.validation_enabled(False))
+        bar = TrainingBar(epochs=strategy.epochs, steps=len(training.loader), shown=progress)
+        training.run(scope.enter_context(bar), on_epoch)
+    return training.state.history
+
+
+class _NotFiniteError(Exception):
+    """What was not finite, by name."""
+
+
+class _Training:
+    def __init__(
+        self,
+        model: nn.Module,
+        guide: nn.Module,
+        train: Sequences | Pairs,
+        strategy: Svi,
+        val: Sequences | Pairs | None,
+        seed: int,
+        device: str,
+    ) -> None:
+        self.model, self.guide, self.strategy = model, guide, strategy
+        self.seed, self.device = seed, torch.device(device)
+        self.loader = _loader(train, strategy, seed, device)
+        self.val = None if val is None else _loader(val, strategy, seed, device)
+        self._first_pass()
+        self.parameters = _parameters(model, guide)
+        self.optimizer = torch.optim.Adam(
+            self.parameters.values(), lr=strategy.learning_rate, fused=True
+        )
+        self.parts = Parts(model, guide, self.optimizer)
+        self.state = State(self.parts.tensors())
+        self.made_of = fingerprint(self.parameters, strategy, seed, training=train, validation=val)
+
+    def keep_in(self, folder: Path | None, log: Log, seconds: float) -> None:
+        self.folder, self.log, self.seconds = folder, log, seconds
+        self.written = time.monotonic()
+
+    def begin(self, resume: str) -> None:
+        found = self.folder is not None and checkpoint.exists(self.folder)
+        if resume == "must" and not found:
+            raise FileNotFoundError(f"resume='must': there is no checkpoint in {self.folder}")
+        if self.folder is not None and resume == "never":
+            checkpoint.clear(self.folder)
+        elif self.folder is not None and found:
+            self.state = State.load(self.folder, self.parts, self.made_of)
+        self.log.start(self.state.history)
+
+    def run(self, bar: TrainingBar, on_epoch: Callable[[Row], None] | None) -> None:
+        try:
+            while not self.state.finished:
+                try:
+                    self._epoch(bar, on_epoch)
+                except _NotFiniteError as what:
+                    self._go_back(str(what))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(self._interrupted()) from None
+
+    def _epoch(self, bar: TrainingBar, on_epoch: Callable[[Row], None] | None) -> None:
+        started, epoch = time.monotonic(), self.state.place.epoch
+        c = ramp(epoch, self.strategy.temper_epochs)
+        beta = ramp(epoch, self.strategy.warmup_epochs)
+        self._steps(c, beta, bar)
+        row = self._row(c, beta)
+        waited = self._validate(row)
+        row["seconds"] = time.monotonic() - started
+        self._report(row, bar, on_epoch)
+        self.state.place = Place(epoch=epoch + 1, step=self.state.place.step, waited=waited)
+        self._close()
+
+    def _steps(self, c: float, beta: float, bar: TrainingBar) -> None:
+        state, place = self.state, self.state.place
+        self.model.train()
+        self.guide.train()
+        start = self.parts.tensors() if place.batch == 0 else None
+        for batch in self.loader.epoch(place.epoch, place.batch):
+            figures = self._step(batch, c, beta)
+            if start is not None:
+                state.good, state.good_place, start = start, place, None
+            state.place = state.place.after(figures)
+            bar.step(place.epoch, state.place.batch)
+            if time.monotonic() - self.written > self.seconds:
+                self._save()
+
+    def _step(self, batch: Batch, c: float, beta: float) -> tuple[float, ...]:
+        """One step of the optimiser; loss, reconstruction, KL and gradient norm of the batch."""
+        self._seed_noise("step", self.state.place.step, self.state.tries)
+        for parameter in self.parameters.values():
+            parameter.grad = None
+        terms = bound(self.model, self.guide, batch, c=c, beta=beta)
+        (terms.loss / batch.total).backward()
+        norm = self._clip()
+        parts = (terms.loss.detach(), terms.reconstruction, terms.kl, norm)
+        *sums, length = torch.stack(parts).tolist()
+        if not all(map(math.isfinite, (*sums, length))):
+            raise _NotFiniteError(self._blame(terms))
+        self.optimizer.param_groups[0]["lr"] = self._rate(self.state.place.step)
+        self.optimizer.step()
+        share = len(batch) / batch.total
+        return *(value * share for value in sums), length * len(batch)
+
+    def _clip(self) -> Tensor:
+        gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
+        norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
+        if self.strategy.clip is not None:
+            shrink = torch.clamp(self.strategy.clip / norm, max=1.0)
+            torch._foreach_mul_(gradients, shrink)
+        return norm
+
+    def _rate(self, step: int) -> float:
+        done = step / (self.strategy.epochs * len(self.loader))
+        return learning_rate(self.strategy, done) * 0.5**self.state.tries
+
+    def _row(self, c: float, beta: float) -> Row:
+        sums = zip(FIGURES, self.state.place.sums, strict=True)
+        means = {name: value / self.loader.total for name, value in sums}
+        row: Row = {"epoch": self.state.place.epoch, **means, "c": c, "beta": beta}
+        return row | {"lr": self._rate(self.state.place.step - 1), "val_elbo": None}
+
+    def _validate(self, row: Row) -> int:
+        """Validate where it is due; how many validations have passed without progress."""
+        epoch, state = row["epoch"] + 1, self.state
+        due = epoch % self.strategy.validate_every == 0 or epoch == self.strategy.epochs
+        if self.val is None or not due:
+            return state.place.waited
+        row["val_elbo"] = elbo = self._plain_bound(self.val)
+        if min(row["c"], row["beta"]) < 1.0:
+            return 0
+        if state.best is not None and elbo <= state.best.elbo:
+            return state.place.waited + 1
+        state.best, state.best_tensors = Best(epoch=epoch - 1, elbo=elbo), self.parts.modules()
+        return 0
+
+    @torch.no_grad()
+    def _plain_bound(self, loader: Loader) -> float:
+        """The un-tempered bound per datum, on the same noise at every call."""
+        self.model.eval()
+        self.guide.eval()
+        self._seed_noise("validation")
+        total = 0.0
+        for batch in loader.sweep():
+            terms = tight_bound(self.model, self.guide, batch)
+            if broken := terms.broken():
+                raise _NotFiniteError(f"{', '.join(broken)} on the validation data")
+            total += terms.elbo.item() * len(batch) / batch.total
+        return total / loader.total
+
+    def _report(self, row: Row, bar: TrainingBar, on_epoch: Callable[[Row], None] | None) -> None:
+        self.state.history.rows.append(row)
+        self.log.add(row)
+        bar.epoch(row)
+        if on_epoch is not None:
+            on_epoch(row)
+
+    def _close(self) -> None:
+        place, strategy = self.state.place, self.strategy
+        bored = strategy.patience is not None and place.waited >= strategy.patience
+        if bored or place.epoch == strategy.epochs:
+            self._finish()
+        elif place.epoch % strategy.checkpoint_every == 0:
+            self._save()
+
+    def _finish(self) -> None:
+        if self.state.best is not None:
+            self.parts.put_modules(self.state.best_tensors)
+        self.state.finished = True
+        self._save()
+        if self.state.place.step >= SETTLED:
+            self._seed_noise("collapse")
+            rows = self.loader.order(0)[: self.strategy.batch_size]
+            warn_of_collapse(self.model, self.guide, self.loader.take(rows))
+
+    def _save(self) -> None:
+        if self.folder is not None:
+            self.state.save(self.folder, self.parts, self.made_of)
+        self.written = time.monotonic()
+
+    def _blame(self, terms: Bound) -> str:
+        if broken := terms.broken():
+            return f"log density {', '.join(broken)}"
+        for name, parameter in self.parameters.items():
+            if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
+                return f"the gradient of {name}"
+        return "the norm of the gradient"
+
+    def _go_back(self, what: str) -> None:
+        """Return to the last good state with half the step size, a bounded number of times."""
+        state = self.state
+        where = f"{what} is not finite at step {state.place.step} (epoch {state.place.epoch})"
+        if state.tries == TRIES:
+            raise TrainingError(
+                f"{where}, after going back {TRIES} times with half the step size each time "
+                f"(learning_rate={self.strategy.learning_rate:g}): try a smaller learning_rate "
+                "or clip, another scaling, or look for outliers in the data"
+            )
+        state.tries += 1
+        state.place = state.good_place
+        self.parts.put(state.good)
+        state.history.back_to(state.place.epoch)
+        self.log.start(state.history)
+        rate = self._rate(state.place.step)
+        again = f"back to the start of epoch {state.place.epoch} with step size {rate:g}"
+        warnings.warn(f"{where}: {again}", TrainingWarning, stacklevel=4)
+
+    def _interrupted(self) -> str:
+        where = f"interrupted in epoch {self.state.place.epoch} of {self.strategy.epochs}"
+        if self.folder is None or not checkpoint.exists(self.folder):
+            return f"{where}; no checkpoint was kept"
+        return f"{where}; resume='auto' goes on from the checkpoint in {self.folder}"
+
+    def _first_pass(self) -> None:
+        """Every check of Pyro on two data; guides that wait for their first call are built too."""
+        self.model.eval()
+        self.guide.eval()
+        self._seed_noise("check")
+        check(self.model, self.guide, self.loader.take(self.loader.order(0)[:2]))
+
+    def _seed_noise(self, *position: int | str) -> None:
+        seed = stream(self.seed, *position)
+        torch.default_generator.manual_seed(seed)
+        if self.device.type == "cuda":
+            torch.cuda.manual_seed(seed)
+
+
+def _loader(data: Sequences | Pairs, strategy: Svi, seed: int, device: str) -> Loader:
+    return Loader(
+        data.to(device=device),
+        batch_size=strategy.batch_size,
+        window=strategy.window,
+        stride=strategy.stride,
+        seed=seed,
+    )
+
+
+def _parameters(model: nn.Module, guide: nn.Module) -> dict[str, nn.Parameter]:
+    named = {f"model.{n}": p for n, p in model.named_parameters() if p.requires_grad}
+    known = set(map(id, named.values()))
+    rest = guide.named_parameters()
+    return named | {f"guide.{n}": p for n, p in rest if p.requires_grad and id(p) not in known}
+
+
+def _accelerators(device: str) -> list[torch.device]:
+    return [torch.device(device)] if torch.device(device).type == "cuda" else []
