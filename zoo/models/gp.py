@@ -1,0 +1,209 @@
+"""Exact Gaussian process regression with the squared exponential covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import pyro
+import torch
+from jaxtyping import Float
+from pyro.distributions import MultivariateNormal
+from torch import Tensor, nn
+
+from zoo.datasets.records import Pairs, Sequences
+from zoo.inference.evidence import dense, pairs_of, patterns
+from zoo.nn.gaussian import joint_draws
+from zoo.nn.kernels import median_distance, squared_distances, squared_exponential
+from zoo.prediction import Predictive
+from zoo.types import Batch, Layout
+
+__all__ = ["Config", "GaussianProcess"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Settings of :class:`GaussianProcess`.
+
+    ``shared``: one length scale and noise ratio for all targets, hence one factorisation; ``ard``:
+    a length scale for each feature; ``noise_floor``: smallest σ_n²/σ_f²; ``noise``: its starting
+    value; ``joint_items``: up to so many new items are drawn jointly.
+    """
+
+    shared: bool = False
+    ard: bool = False
+    noise: float = 0.1
+    noise_floor: float = 1e-6
+    joint_items: int = 512
+
+    def __post_init__(self) -> None:
+        """Refuse settings that have no meaning."""
+        if not 0 < self.noise_floor < self.noise:
+            raise ValueError(
+                f"0 < noise_floor < noise is needed; got {self.noise_floor} and {self.noise}"
+            )
+        if self.joint_items < 0:
+            raise ValueError(f"joint_items must not be negative; got {self.joint_items}")
+
+
+class _Group(NamedTuple):
+    """Targets with the same observed items and hyperparameters: they share a factorisation."""
+
+    items: Tensor
+    targets: list[int]
+    kernel: int
+
+
+class GaussianProcess(nn.Module):
+    """A Gaussian process for each target, with its posterior in closed form.
+
+    ``f_p ~ GP(0, σ_f² exp(−‖x − x'‖²/2l²))``, ``y_p ~ N(f_p, σ_n²)`` — (35), (36); the posterior is
+    (39), (40). Length scale l (of every feature with ``ard``), noise σ_n and signal σ_f maximise
+    the evidence (41) with the gradient (42); σ_f² is profiled out. Each target has its own
+    hyperparameters unless ``shared``. Missing targets are left out, target by target. Thesis
+    §2.1.6 and §3.2.3, with the squared distance that (35) means; Rasmussen & Williams (2006).
+
+    Cost grows with the cube of the items: up to some 3000; ``fitc`` goes beyond. It gives no
+    joint distribution over targets, which are independent in this model.
+    """
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float64
+
+    inputs: Tensor
+    targets: Tensor
+    observed: Tensor
+    signal: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """Hyperparameters for the layout's features and targets; data come by ``condition``."""
+        super().__init__()
+        self.layout, self.config = layout, config
+        kernels = 1 if config.shared else len(layout.channels)
+        lengths = len(layout.inputs) if config.ard else 1
+        self.log_length = nn.Parameter(torch.zeros(kernels, lengths, dtype=self.dtype))
+        self.log_noise = nn.Parameter(torch.zeros(kernels, dtype=self.dtype))
+        for name in ("inputs", "targets", "observed", "signal"):
+            self.register_buffer(name, torch.empty(0, dtype=self.dtype))
+        self._distances: Tensor | None = None
+        self._factors: list[Tensor] = []
+
+    @property
+    def length(self) -> Float[Tensor, "kernel feature"]:
+        """Length scales l."""
+        return self.log_length.exp()
+
+    @property
+    def noise(self) -> Float[Tensor, " kernel"]:
+        """Noise ratio σ_n²/σ_f²."""
+        return self.config.noise_floor + self.log_noise.exp()
+
+    def condition(self, data: Sequences | Pairs) -> None:
+        """Take in the training pairs; start at the median distance and the configured noise."""
+        data = pairs_of(data)
+        self.inputs, self.targets = data.inputs.to(self.dtype), data.targets.to(self.dtype)
+        self.observed = data.mask.to(self.dtype)
+        self._distances = squared_distances(self.inputs, self.inputs)
+        self._factors = []
+        with torch.no_grad():
+            self.log_length.fill_(median_distance(self._distances).log())
+            self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
+
+    def objective(self) -> Float[Tensor, ""]:
+        """Minus the log evidence (41), summed over targets."""
+        terms = [dense(self._covariance(g), self._observed_targets(g)) for g in self._groups()]
+        return torch.stack(terms).sum()
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Keep σ_f² of every target under the final hyperparameters."""
+        signal = torch.zeros_like(self.targets[0])
+        for group in self._groups():
+            y = self._observed_targets(group)
+            alpha = torch.cholesky_solve(y, torch.linalg.cholesky(self._covariance(group)))
+            signal[group.targets] = (y * alpha).mean(0)
+        self.signal = signal
+        self._distances, self._factors = None, []
+
+    @torch.no_grad()
+    def regress(self, inputs: Float[Tensor, "item feature"], *, draws: int) -> Predictive:
+        """Posterior (39), (40) of every target, with joint draws over not too many items."""
+        mean = inputs.new_empty(len(inputs), len(self.signal))
+        variance = torch.empty_like(mean)
+        joint = draws > 0 and len(inputs) <= self.config.joint_items
+        paths = mean.new_empty(draws, *mean.shape) if joint else None
+        for group, factor in zip(self._groups(), self._factorised(), strict=True):
+            which, signal = group.targets, self.signal[group.targets]
+            cross = self._kernel(group.kernel, self.inputs[group.items], inputs)
+            alpha = torch.cholesky_solve(self._observed_targets(group), factor)
+            explained = torch.linalg.solve_triangular(factor, cross, upper=False)
+            mean[:, which] = cross.mT @ alpha
+            left = (1 - explained.square().sum(0)).clamp_min(0)
+            variance[:, which] = left[:, None] * signal
+            if paths is not None:
+                covariance = self._kernel(group.kernel, inputs, inputs) - explained.mT @ explained
+                paths[:, :, which] = joint_draws(mean[:, which], covariance, signal, draws)
+        return Predictive(
+            location=mean[None],
+            noise=self._noise_variance().sqrt(),
+            epistemic=variance.sqrt()[None],
+            draws=paths,
+        )
+
+    def forward(self, batch: Batch) -> None:
+        """p(y | x) of a whole training set, f integrated out; its log density is the evidence."""
+        if batch.inputs is None or len(batch) != batch.total:
+            raise ValueError(f"the evidence needs all {batch.total} items with inputs at once")
+        x = batch.inputs.reshape(len(batch), -1)
+        y = batch.values.reshape(len(batch), -1)
+        mask = torch.ones_like(y, dtype=torch.bool) if batch.mask is None else batch.mask
+        for p in range(y.shape[1]):
+            rows = mask.reshape(y.shape)[:, p]
+            kernel = 0 if self.config.shared else p
+            covariance = self._kernel(kernel, x[rows], x[rows])
+            covariance = covariance + self.noise[kernel] * torch.eye(len(covariance)).to(y)
+            law = MultivariateNormal(torch.zeros_like(y[rows, p]), self.signal[p] * covariance)
+            pyro.sample(f"y_{p}", law, obs=y[rows, p])
+
+    def report(self) -> dict[str, Any]:
+        """Hyperparameters in the model's scale."""
+        return {
+            "length_scale": self.length.tolist(),
+            "signal_std": self.signal.sqrt().tolist(),
+            "noise_std": self._noise_variance().sqrt().tolist(),
+        }
+
+    def _groups(self) -> list[_Group]:
+        found = []
+        for observed, targets in patterns(self.observed.bool()):
+            items = observed.nonzero()[:, 0]
+            split = [targets] if self.config.shared else [(t,) for t in targets]
+            found += [_Group(items, list(t), 0 if self.config.shared else t[0]) for t in split]
+        return found
+
+    def _observed_targets(self, group: _Group) -> Tensor:
+        return self.targets[group.items][:, group.targets]
+
+    def _covariance(self, group: _Group) -> Tensor:
+        """κ + ρI over the observed items."""
+        items = group.items
+        if self._distances is None or self.config.ard:
+            covariance = self._kernel(group.kernel, self.inputs[items], self.inputs[items])
+        else:
+            distances = self._distances[items][:, items]
+            covariance = squared_exponential(distances, self.log_length[group.kernel, 0])
+        noise = self.noise[group.kernel].expand(len(items))
+        return covariance + torch.diag(noise)
+
+    def _kernel(self, kernel: int, a: Tensor, b: Tensor) -> Tensor:
+        length = self.length[kernel]
+        distances = squared_distances(a / length, b / length)
+        return squared_exponential(distances, distances.new_zeros(()))
+
+    def _factorised(self) -> list[Tensor]:
+        if not self._factors:
+            self._factors = [torch.linalg.cholesky(self._covariance(g)) for g in self._groups()]
+        return self._factors
+
+    def _noise_variance(self) -> Float[Tensor, " target"]:
+        return (self.noise * self.signal).detach()
