@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, Self
+from statistics import NormalDist
+from typing import Any, Literal, Protocol, Self
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from zoo import mixtures
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
 
 __all__ = ["Prediction", "Predictive", "Recalibration"]
@@ -36,6 +37,17 @@ class Predictive:
     joint: bool = False
     draws: Float[Tensor, "sample *shape"] | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse parts that do not fit ``location``."""
+        shape = self.location.shape
+        if not shape or shape[0] < 1:
+            raise ValueError(f"location needs a component axis; it has shape {tuple(shape)}")
+        _check_broadcast("noise", self.noise, shape)
+        _check_broadcast("epistemic", self.epistemic, shape)
+        if self.draws is not None and (not len(self.draws) or self.draws.shape[1:] != shape[1:]):
+            got = tuple(self.draws.shape)
+            raise ValueError(f"draws have shape {got}; (sample, *{tuple(shape[1:])}) is needed")
+
     def affine(self, scale: Tensor, shift: Tensor) -> Predictive:
         """The same distribution of ``scale * y + shift`` (both broadcast over the last axis)."""
         return Predictive(
@@ -54,12 +66,20 @@ class Recalibration(Protocol):
         """Corrected quantile of every coordinate."""
         ...
 
+    def cdf(self, raw: Prediction, value: Tensor) -> Tensor:
+        """Corrected distribution function of every coordinate at ``value``."""
+        ...
+
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Draws of the raw marginals, moved to the corrected marginals."""
         ...
 
     def predictive(self, raw: Prediction) -> Predictive | None:
         """The corrected distribution where it is still a Gaussian mixture, else None."""
+        ...
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """What a file must keep of it: JSON with its ``kind``, and tensors."""
         ...
 
 
@@ -88,8 +108,13 @@ class Prediction:
         shape = tuple(self.predictive.location.shape[1:])
         if len(shape) != len(self.axes):
             raise ValueError(f"prediction has shape {shape}; axes are {self.axes}")
-        if len(self.names) != shape[-1]:
-            raise ValueError(f"{len(self.names)} names for {shape[-1]} {self.axes[-1]}s")
+        for what in ("names", "units"):
+            if len(getattr(self, what)) != shape[-1]:
+                raise ValueError(
+                    f"{len(getattr(self, what))} {what} for {shape[-1]} {self.axes[-1]}s"
+                )
+        if self.lengths is not None and tuple(self.lengths.shape) != shape[:1]:
+            raise ValueError(f"{len(self.lengths)} lengths for {shape[0]} {self.axes[0]}s")
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -101,6 +126,14 @@ class Prediction:
         """Whether the model gives any uncertainty."""
         p = self.predictive
         return p.noise is not None or p.epistemic is not None or p.location.shape[0] > 1
+
+    @property
+    def seconds(self) -> Tensor | None:
+        """Time of every frame in s from the start of the movement; None without a rate."""
+        if self.rate is None or "time" not in self.axes:
+            return None
+        frames = self.shape[self.axes.index("time")]
+        return torch.arange(self.offset, self.offset + frames, dtype=torch.float64) / self.rate
 
     @property
     def effective(self) -> Predictive | None:
@@ -137,7 +170,7 @@ class Prediction:
         p = self._mixture()
         variance = p.location.var(0, unbiased=False)
         if p.epistemic is not None:
-            variance = variance + p.epistemic.square()
+            variance = variance + p.epistemic.expand_as(p.location).square().mean(0)
         return variance.sqrt()
 
     @property
@@ -156,33 +189,55 @@ class Prediction:
         self._need_spread()
         if self.recalibration is not None:
             return self.recalibration.quantile(self.raw, level)
-        return _mixture_quantile(self._mixture(), level)
+        return self.quantile_at(NormalDist().inv_cdf(level))
+
+    def quantile_at(self, score: float) -> Tensor:
+        """Quantile at the level Φ(``score``), which reaches further into the tails."""
+        self._need_spread()
+        p = self._mixture()
+        return mixtures.quantile(p.location, _component_scale(p), score)
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
         """Central interval that holds ``level`` of the probability."""
         return self.quantile((1 - level) / 2), self.quantile((1 + level) / 2)
 
     def cdf(self, value: Tensor) -> Tensor:
-        """Predictive distribution function of every coordinate at ``value``."""
+        """Predictive distribution function of every coordinate at ``value``.
+
+        ``value`` broadcasts to the prediction, or holds draws with a leading ``sample`` axis.
+        """
         self._need_spread()
-        return _mixture_cdf(self._mixture(), value)
+        value = self._expand(value)
+        if self.recalibration is not None:
+            return self.recalibration.cdf(self.raw, value)
+        p = self._mixture()
+        return mixtures.cdf(p.location, _component_scale(p), value)
+
+    def normal_score(self, value: Tensor) -> Tensor:
+        """Φ⁻¹ of :meth:`cdf`, exact far out in both tails: (y − mean) / std for a Gaussian."""
+        self._need_spread()
+        p = self._mixture()
+        return mixtures.normal_score(p.location, _component_scale(p), self._expand(value))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log marginal density of every coordinate at ``value``."""
         self._need_spread()
         p = self._mixture()
         scale = _component_scale(p)
-        log_density = torch.distributions.Normal(p.location, scale).log_prob(value)
-        return log_density.logsumexp(0) - math.log(p.location.shape[0])
+        if scale is None:
+            raise NoDensityError("this prediction is a set of draws without noise: no density")
+        return mixtures.log_density(p.location, scale, self._expand(value))
 
     def sample(self, count: int, *, seed: int = 0, joint: bool = True) -> Tensor:
         """``count`` draws with their noise; joint trajectories unless ``joint=False``."""
         self._need_spread()
+        if count < 1:
+            raise ValueError(f"count must be at least 1; got {count}")
         generator = torch.Generator(device=self.mean.device).manual_seed(seed)
-        draws = self._draw(count, generator, joint)
-        return (
-            draws if self.recalibration is None else self.recalibration.transport(self.raw, draws)
-        )
+        draws = self._paths(count, generator) if joint else self._marginals(count, generator)
+        if self.recalibration is None:
+            return draws
+        return self.recalibration.transport(self.raw, draws)
 
     def channel(self, name: str) -> int:
         """Index of a channel or target by name."""
@@ -210,67 +265,68 @@ class Prediction:
             )
         return mixture
 
-    def _draw(self, count: int, generator: torch.Generator, joint: bool) -> Tensor:
+    def _expand(self, value: Tensor) -> Tensor:
+        leading = value.shape[:1] if value.ndim == len(self.shape) + 1 else ()
+        try:
+            return value.to(self.predictive.location).expand(*leading, *self.shape)
+        except RuntimeError:
+            raise ValueError(
+                f"value has shape {tuple(value.shape)}; the prediction has {self.shape}"
+            ) from None
+
+    def _paths(self, count: int, generator: torch.Generator) -> Tensor:
         p = self.predictive
-        paths = p.location if p.draws is None else p.draws
-        if joint and not (p.joint or p.draws is not None):
+        if p.draws is not None:
+            path = p.draws[_picks(count, p.draws, generator)]
+            noise = None if p.noise is None else self.raw.aleatoric
+            return _with_noise(path, noise, generator)
+        if not p.joint or p.epistemic is not None:
             raise NoJointSamplesError(
                 "this prediction knows the marginals only; ask for sample(count, joint=False)"
             )
-        if joint:
-            pick = torch.randint(paths.shape[0], (count,), generator=generator, device=paths.device)
-            path, scale = paths[pick], p.noise
-            scale = (
-                scale.expand_as(p.location)[pick if p.draws is None else [0] * count]
-                if scale is not None
-                else None
-            )
-        else:
-            shape = (count, *self.shape)
-            pick = torch.randint(
-                p.location.shape[0], shape, generator=generator, device=paths.device
-            )
-            path = p.location.gather(0, pick)
-            scale = _component_scale(p).expand_as(p.location).gather(0, pick)
-        if scale is None:
-            return path
-        return path + scale * torch.randn(
-            path.shape, generator=generator, dtype=path.dtype, device=path.device
-        )
+        pick = _picks(count, p.location, generator)
+        noise = None if p.noise is None else p.noise.expand_as(p.location)[pick]
+        return _with_noise(p.location[pick], noise, generator)
+
+    def _marginals(self, count: int, generator: torch.Generator) -> Tensor:
+        p = self.predictive
+        like = p.location
+        shape = (count, *self.shape)
+        pick = torch.randint(like.shape[0], shape, generator=generator, device=like.device)
+        scale = _component_scale(p)
+        noise = None if scale is None else scale.expand_as(like).gather(0, pick)
+        return _with_noise(like.gather(0, pick), noise, generator)
 
 
-def _component_scale(p: Predictive) -> Tensor:
-    variance = torch.zeros_like(p.location)
-    for part in (p.noise, p.epistemic):
-        if part is not None:
-            variance = variance + part.square()
-    if p.noise is None and p.epistemic is None:
-        raise NoDensityError("this prediction is a set of draws without noise: it has no density")
-    return variance.sqrt()
+def _component_scale(p: Predictive) -> Tensor | None:
+    """Standard deviation of every component; None for draws without noise."""
+    parts = [part.square() for part in (p.noise, p.epistemic) if part is not None]
+    return sum(parts[1:], parts[0]).sqrt() if parts else None
 
 
-def _mixture_cdf(p: Predictive, value: Tensor) -> Tensor:
-    if p.noise is None and p.epistemic is None:
-        return (p.location <= value).to(p.location.dtype).mean(0)
-    below: Tensor = torch.special.ndtr((value - p.location) / _component_scale(p))
-    return below.mean(0)
+def _picks(count: int, paths: Tensor, generator: torch.Generator) -> Tensor:
+    """``count`` rows of ``paths``, none twice before each was drawn once."""
+    total = paths.shape[0]
+    rounds = [
+        torch.randperm(total, generator=generator, device=paths.device)
+        for _ in range(-(-count // total))
+    ]
+    return torch.cat(rounds)[:count]
 
 
-def _mixture_quantile(p: Predictive, level: float) -> Tensor:
-    if p.noise is None and p.epistemic is None:
-        return p.location.quantile(level, dim=0)
-    scale = _component_scale(p)
-    standard = torch.special.ndtri(torch.tensor(level, dtype=scale.dtype, device=scale.device))
-    ends = p.location + scale * standard
-    low, high = ends.amin(0), ends.amax(0)
-    if p.location.shape[0] == 1:
-        return low
-    return _bisect(lambda x: _mixture_cdf(p, x), level, low, high)
+def _with_noise(path: Tensor, noise: Tensor | None, generator: torch.Generator) -> Tensor:
+    if noise is None:
+        return path
+    return path + noise * torch.randn(
+        path.shape, generator=generator, dtype=path.dtype, device=path.device
+    )
 
 
-def _bisect(cdf: Callable[[Tensor], Tensor], level: float, low: Tensor, high: Tensor) -> Tensor:
-    for _ in range(40):
-        middle = (low + high) / 2
-        below = cdf(middle) < level
-        low, high = torch.where(below, middle, low), torch.where(below, high, middle)
-    return (low + high) / 2
+def _check_broadcast(what: str, tensor: Tensor | None, shape: torch.Size) -> None:
+    if tensor is None:
+        return
+    padded = (1,) * (len(shape) - tensor.ndim) + tuple(tensor.shape)
+    if len(padded) != len(shape) or any(
+        a not in (1, b) for a, b in zip(padded, shape, strict=True)
+    ):
+        raise ValueError(f"{what} has shape {tuple(tensor.shape)}; location has {tuple(shape)}")
