@@ -1,0 +1,266 @@
+"""Movements of unequal length with missing entries, group columns and known inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from zoo.datasets.checks import (
+    Groups,
+    distinct_names,
+    group_columns,
+    matrix,
+    pad,
+    pad_controls,
+    rows_of,
+    units_of,
+)
+from zoo.datasets.resample import resample_movements
+from zoo.datasets.split import matching_rows, named_columns, split_rows
+from zoo.datasets.windows import cut
+from zoo.types import Layout
+
+__all__ = ["Sequences"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sequences:
+    """Movements of unequal length: values in ``units``, one row of ``groups`` for each movement.
+
+    ``values`` is padded to the longest movement; padding and missing entries hold 0 and are False
+    in ``mask``. ``controls`` are known inputs of every frame (actions), with their own names.
+    ``rate`` is in Hz; where ``time_normalised``, every movement was stretched to one length, and it
+    is that of the mean duration. ``provenance`` is ``public``, ``thesis`` or ``simulated``.
+    """
+
+    values: Float[Tensor, "sequence time channel"]
+    mask: Bool[Tensor, "sequence time channel"]
+    lengths: Int[Tensor, " sequence"]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    rate: float
+    groups: Groups = field(default_factory=dict)
+    controls: Float[Tensor, "sequence time control"] | None = None
+    control_names: tuple[str, ...] = ()
+    control_units: tuple[str, ...] = ()
+    time_normalised: bool = False
+    name: str = "sequences"
+    provenance: str = "public"
+
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: Sequence[ArrayLike] | NDArray[np.floating],
+        *,
+        rate: float,
+        channels: Sequence[str] | None = None,
+        units: str | Sequence[str] = "",
+        groups: Mapping[str, Sequence[object]] | None = None,
+        controls: Sequence[ArrayLike] | None = None,
+        control_names: Sequence[str] | None = None,
+        control_units: str | Sequence[str] = "",
+        name: str = "sequences",
+        provenance: str = "public",
+    ) -> Self:
+        """Sequences from a list of arrays (time, channel); NaN marks a missing entry.
+
+        >>> import numpy as np
+        >>> data = Sequences.from_arrays([np.zeros((5, 2)), np.ones((7, 2))], rate=100.0,
+        ...     channels=["hip", "knee"], units="rad", groups={"subject": ["a", "b"]})
+        >>> len(data), data.lengths.tolist(), data.channels
+        (2, [5, 7], ('hip', 'knee'))
+        """
+        parts = [matrix(a, f"sequence {i}") for i, a in enumerate(arrays)]
+        if not parts:
+            raise ValueError("arrays is empty; at least one sequence is needed")
+        if not rate > 0:
+            raise ValueError(f"rate must be positive, in Hz; got {rate}")
+        names = distinct_names(channels, parts[0].shape[1], "channel")
+        values, mask, lengths = pad(parts, len(names), "channels")
+        known = None if controls is None else pad_controls(controls, lengths)
+        width = 0 if known is None else known.shape[2]
+        return cls(
+            values=values,
+            mask=mask,
+            lengths=lengths,
+            channels=names,
+            units=units_of(units, len(names)),
+            rate=float(rate),
+            groups=group_columns(groups, len(parts), "sequences", "trial"),
+            controls=known,
+            control_names=distinct_names(control_names, width, "control"),
+            control_units=units_of(control_units, width),
+            name=name,
+            provenance=provenance,
+        )
+
+    def __len__(self) -> int:
+        """Number of movements."""
+        return int(self.values.shape[0])
+
+    def __getitem__(self, index: int | slice | Sequence[int]) -> Self:
+        """A subset of the movements."""
+        rows = rows_of(index, len(self))
+        lengths = self.lengths[rows]
+        end = int(lengths.max()) if len(rows) else 0
+        return replace(
+            self,
+            values=self.values[rows, :end],
+            mask=self.mask[rows, :end],
+            lengths=lengths,
+            controls=None if self.controls is None else self.controls[rows, :end],
+            groups={k: tuple(v[i] for i in rows) for k, v in self.groups.items()},
+        )
+
+    @property
+    def layout(self) -> Layout:
+        """Names, units, rate (None after time normalisation) and the length all have, if any."""
+        equal = bool((self.lengths == self.lengths[0]).all())
+        return Layout(
+            kind="sequences",
+            channels=self.channels,
+            units=self.units,
+            inputs=self.control_names,
+            input_units=self.control_units,
+            rate=None if self.time_normalised else self.rate,
+            frames=int(self.lengths[0]) if equal else None,
+        )
+
+    @property
+    def arrays(self) -> list[NDArray[np.float64]]:
+        """The movements as numpy arrays (time, channel) with NaN where an entry is missing."""
+        full = torch.where(self.mask, self.values, torch.nan).double().numpy()
+        return [full[i, : int(n)] for i, n in enumerate(self.lengths)]
+
+    def first(self, frames: int) -> Self:
+        """The first ``frames`` frames of every movement."""
+        return self.frames(0, frames)
+
+    def frames(self, start: int, stop: int) -> Self:
+        """Frames ``start`` to ``stop`` (exclusive) of every movement; all must be long enough."""
+        if not 0 <= start < stop:
+            raise ValueError(f"frames needs 0 <= start < stop; got {start}, {stop}")
+        short = int(self.lengths.min())
+        if stop > short:
+            raise ValueError(
+                f"frames up to {stop} were asked for; the shortest movement has {short}"
+            )
+        return replace(
+            self,
+            values=self.values[:, start:stop],
+            mask=self.mask[:, start:stop],
+            lengths=torch.full_like(self.lengths, stop - start),
+            controls=None if self.controls is None else self.controls[:, start:stop],
+        )
+
+    def split(self, *, by: str, parts: Sequence[float], seed: int = 0) -> list[Self]:
+        """Parts in the given shares that have no value of group column ``by`` in common.
+
+        ``by="frame"`` takes the movements apart into single frames and deals these out, which
+        puts neighbours on both sides: for models of single frames only. See
+        :func:`zoo.datasets.split.split_rows`.
+
+        >>> data = Sequences.from_arrays(np.zeros((10, 5, 2)), rate=1.0)
+        >>> [len(part) for part in data.split(by="trial", parts=(.6, .1, .1, .2), seed=0)]
+        [6, 1, 1, 2]
+        """
+        whole = self.windows(1) if by == "frame" and by not in self.groups else self
+        rows = split_rows(whole.groups, by=by, parts=parts, seed=seed, count=len(whole))
+        return [whole[part] for part in rows]
+
+    def windows(self, length: int, stride: int = 1) -> Self:
+        """Sub-sequences of ``length`` frames, one every ``stride`` frames, as a record of its own.
+
+        They keep the groups of their movement and add the column ``start``, the frame of the
+        movement that they start at. Frames after the last whole window are left out.
+
+        >>> data = Sequences.from_arrays([np.zeros((5, 2)), np.zeros((7, 2))], rate=1.0)
+        >>> cut = data.windows(4, stride=2)
+        >>> len(cut), cut.groups
+        (3, {'trial': ('0', '1', '1'), 'start': ('0', '0', '2')})
+        """
+        sequence, frame = cut(self.lengths, length, stride)
+        before = [int(s) for s in self.groups.get("start", ("0",) * len(self))]
+        owner, start = sequence[:, 0].tolist(), frame[:, 0].tolist()
+        groups = {k: tuple(v[i] for i in owner) for k, v in self.groups.items()}
+        groups["start"] = tuple(str(before[i] + s) for i, s in zip(owner, start, strict=True))
+        return replace(
+            self,
+            values=self.values[sequence, frame],
+            mask=self.mask[sequence, frame],
+            lengths=torch.full((len(owner),), length),
+            groups=groups,
+            controls=None if self.controls is None else self.controls[sequence, frame],
+        )
+
+    def resampled(self, frames: int | None = None, *, rate: float | None = None) -> Self:
+        """Every movement with ``frames`` frames from its first to its last, or at ``rate`` Hz.
+
+        Linear on a finer grid, low-pass filtered on a coarser one, see
+        :mod:`zoo.datasets.resample`. ``frames`` normalises time: ``rate`` is then that of the mean
+        duration, and the layout has none.
+
+        >>> data = Sequences.from_arrays([np.arange(9.)[:, None], np.arange(5.)[:, None]], rate=4.)
+        >>> half = data.resampled(rate=2.0)
+        >>> half.lengths.tolist(), half.values[0, :, 0].tolist()
+        ([5, 3], [0.0, 2.0, 4.0, 6.0, 8.0])
+        >>> data.resampled(3).lengths.tolist(), data.resampled(3).layout.rate
+        ([3, 3], None)
+        """
+        grid = resample_movements(self, frames, rate)
+        normalised = self.time_normalised or frames is not None
+        return replace(
+            self,
+            values=grid.values,
+            mask=grid.mask,
+            lengths=grid.lengths,
+            controls=grid.controls,
+            rate=grid.rate,
+            time_normalised=normalised,
+        )
+
+    def select(self, channels: Sequence[str]) -> Self:
+        """The named channels, in the order named.
+
+        >>> data = Sequences.from_arrays(np.zeros((1, 5, 2)), rate=1.0, channels=["hip", "knee"])
+        >>> data.select(channels=["knee"]).values.shape
+        torch.Size([1, 5, 1])
+        """
+        columns = named_columns(self.channels, channels, "channel")
+        return replace(
+            self,
+            values=self.values[..., columns],
+            mask=self.mask[..., columns],
+            channels=tuple(self.channels[c] for c in columns),
+            units=tuple(self.units[c] for c in columns),
+        )
+
+    def where(self, **columns: object) -> Self:
+        """The movements whose group columns have the given values (a list: any of them).
+
+        >>> data = Sequences.from_arrays(np.zeros((3, 5, 2)), rate=1.0, groups={"subject": "aab"})
+        >>> len(data.where(subject="a"))
+        2
+        """
+        return self[matching_rows(self.groups, columns, len(self))]
+
+    def to(
+        self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Self:
+        """The record with its values in another type or on another device."""
+        return replace(
+            self,
+            values=self.values.to(device=device, dtype=dtype),
+            mask=self.mask.to(device=device),
+            lengths=self.lengths.to(device=device),
+            controls=None
+            if self.controls is None
+            else self.controls.to(device=device, dtype=dtype),
+        )
