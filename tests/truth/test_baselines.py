@@ -1,0 +1,401 @@
+"""The sceptic's baselines against the same numbers by other roads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pyro.poutine as poutine
+import pytest
+import torch
+
+from zoo.datasets.records import Pairs, Sequences
+from zoo.dynamics.analogues import interpolated
+from zoo.errors import NotFittedError
+from zoo.inference.loader import whole
+from zoo.models import autoregression, last_value, mean, nearest_neighbour
+from zoo.models.autoregression import Autoregression
+from zoo.models.last_value import LastValue
+from zoo.models.mean import Mean, MeanRegressor
+from zoo.models.nearest_neighbour import NearestNeighbour
+from zoo.prediction import Prediction
+
+A_1 = np.array([[1.2, 0.1], [-0.2, 0.9]])
+A_2 = np.array([[-0.5, 0.0], [0.1, -0.3]])
+ROOT_Q = np.array([[0.3, 0.0], [0.1, 0.2]])
+MODELS = [(Mean, mean), (LastValue, last_value), (Autoregression, autoregression)]
+ALL = [*MODELS, (NearestNeighbour, nearest_neighbour)]
+
+
+def simulate(movements: int = 6, frames: int = 40, seed: int = 0) -> Sequences:
+    """Movements of a known vector autoregression of order 2, of unequal length."""
+    rng = np.random.default_rng(seed)
+    arrays = []
+    for i in range(movements):
+        x = [rng.normal(size=2), rng.normal(size=2)]
+        for _ in range(frames - i):
+            x.append(0.1 + A_1 @ x[-1] + A_2 @ x[-2] + ROOT_Q @ rng.normal(size=2))
+        arrays.append(np.array(x[2:]))
+    groups = {"trial": range(movements), "subject": [i // 2 for i in range(movements)]}
+    return Sequences.from_arrays(arrays, rate=30.0, channels=["hip", "knee"], groups=groups)
+
+
+def with_holes(data: Sequences, share: float = 0.1) -> Sequences:
+    keep = torch.rand(data.mask.shape, generator=torch.Generator().manual_seed(1)) > share
+    mask = data.mask & keep
+    return replace(data, mask=mask, values=torch.where(mask, data.values, 0.0))
+
+
+def fitted(kind, home, data, **settings):  # type: ignore[no-untyped-def]
+    model = kind(data.layout, home.Config(**settings))
+    model.condition(data)
+    return model
+
+
+def prediction(predictive, data: Sequences) -> Prediction:  # type: ignore[no-untyped-def]
+    return Prediction(
+        predictive=predictive,
+        axes=("sequence", "time", "channel"),
+        names=data.channels,
+        units=data.units,
+        task="forecast",
+    )
+
+
+def test_mean_equals_the_moments_of_numpy_over_ragged_movements_with_holes() -> None:
+    data = with_holes(simulate())
+    model = fitted(Mean, mean, data)
+    arrays = data.arrays
+    for t in (0, 5, 20):
+        frame = np.array([a[t] for a in arrays if len(a) > t])
+        count = (~np.isnan(frame)).sum(0)
+        np.testing.assert_allclose(model.mean[t].numpy(), np.nanmean(frame, 0), rtol=1e-12)
+        spread = np.nanstd(frame, 0, ddof=1)
+        np.testing.assert_allclose(model.deviation[t].numpy(), spread, rtol=1e-10)
+        np.testing.assert_allclose(model.error[t].numpy(), spread / np.sqrt(count), rtol=1e-10)
+    everything = np.concatenate(arrays)
+    np.testing.assert_allclose(model.mean[-1].numpy(), np.nanmean(everything, 0), rtol=1e-10)
+    beyond = model.forecast(whole(data), None, horizon=4, draws=3).location[0, :, -1]
+    torch.testing.assert_close(beyond, model.mean[-1].expand(len(data), 2))
+
+
+def test_mean_regressor_equals_the_moments_of_numpy() -> None:
+    y = np.array([[1.0, 4.0], [2.0, np.nan], [6.0, 8.0]])
+    pairs = Pairs.from_arrays(np.zeros((3, 1)), y)
+    model = fitted(MeanRegressor, mean, pairs)
+    answer = model.regress(torch.zeros(5, 1).double(), draws=2)
+    assert answer.location.shape == (1, 5, 2)
+    np.testing.assert_allclose(answer.location[0, 0].numpy(), [3, 6])
+    np.testing.assert_allclose(answer.noise.numpy(), np.nanstd(y, 0, ddof=1))
+    log_density = poutine.trace(model).get_trace(whole(pairs)).log_prob_sum()
+    normal = torch.distributions.Normal(model.mean, model.deviation)
+    expected = normal.log_prob(pairs.targets)[pairs.mask].sum()
+    torch.testing.assert_close(log_density, expected)
+
+
+def test_last_value_spread_is_the_root_mean_square_of_the_increments() -> None:
+    data = with_holes(simulate())
+    model = fitted(LastValue, last_value, data)
+    for lead in (1, 2, 7):
+        steps = np.concatenate([a[lead:] - a[:-lead] for a in data.arrays])
+        expected = np.sqrt(np.nanmean(steps**2, 0))
+        np.testing.assert_allclose(model.spread[lead - 1].numpy(), expected, rtol=1e-10)
+    longest = len(model.spread)
+    far = model.forecast(whole(data.first(5)), None, horizon=4 * longest, draws=2).epistemic
+    torch.testing.assert_close(far[0, -1], 2 * model.spread[-1])
+
+
+def test_last_value_counts_the_lead_from_the_frame_last_seen() -> None:
+    data = simulate()
+    model = fitted(LastValue, last_value, data)
+    seen = data.first(10)
+    mask = seen.mask.clone()
+    mask[0, 7:, 0] = False
+    mask[1, :, 1] = False
+    batch = whole(replace(seen, mask=mask, values=torch.where(mask, seen.values, 0.0)))
+    answer = model.forecast(batch, None, horizon=3, draws=5)
+    assert answer.location[0, 0, :, 0].tolist() == [float(seen.values[0, 6, 0])] * 3
+    torch.testing.assert_close(answer.epistemic[0, :, 0], model.spread[3:6, 0])
+    torch.testing.assert_close(answer.location[0, 1, :, 1], model.mean[1].expand(3))
+    torch.testing.assert_close(answer.epistemic[1, :, 1], model.deviation[1].expand(3))
+
+
+def test_last_value_draws_of_a_random_walk_have_its_covariance() -> None:
+    rng = np.random.default_rng(0)
+    walks = [np.cumsum(rng.normal(size=(300, 1)), 0) for _ in range(60)]
+    data = Sequences.from_arrays(walks, rate=30.0)
+    model = fitted(LastValue, last_value, data)
+    count = 20_000
+    torch.manual_seed(0)
+    draws = model.forecast(whole(data[:1].first(2)), None, horizon=6, draws=count).draws
+    steps = draws[:, 0, :, 0] - data.values[0, 1, 0]
+    lead = torch.arange(1.0, 7).double()
+    expected = torch.minimum(lead[:, None], lead)
+    variance = (expected**2 + lead[:, None] * lead) / count
+    # 2 % for the variogram itself, which 60 walks of 300 steps fit.
+    tolerance = 6 * variance.sqrt() + 0.02 * expected
+    assert bool(((steps.T.cov() - expected).abs() < tolerance).all())
+
+
+@pytest.mark.parametrize("coupling", ["channel", "vector"])
+@pytest.mark.parametrize("holes", [False, True])
+def test_ar_coefficients_equal_least_squares(coupling: str, holes: bool) -> None:
+    data = with_holes(simulate()) if holes else simulate()
+    model = fitted(Autoregression, autoregression, data, coupling=coupling, ridge=0.0)
+    blocks = [[0], [1]] if coupling == "channel" else [[0, 1]]
+    for b, block in enumerate(blocks):
+        rows, now = [], []
+        for a in data.arrays:
+            x = a[:, block]
+            rows.append(np.hstack([np.ones((len(x) - 2, 1)), x[1:-1], x[:-2]]))
+            now.append(x[2:])
+        x, y = np.concatenate(rows), np.concatenate(now)
+        known = ~np.isnan(np.hstack([x, y])).any(1)
+        beta, *_ = np.linalg.lstsq(x[known], y[known], rcond=None)
+        w = len(block)
+        np.testing.assert_allclose(model.intercept[b].numpy(), beta[0], atol=1e-9)
+        np.testing.assert_allclose(model.coefficients[0, b].numpy(), beta[1 : 1 + w].T, atol=1e-9)
+        np.testing.assert_allclose(model.coefficients[1, b].numpy(), beta[1 + w :].T, atol=1e-9)
+        residual = (y - x @ beta)[known]
+        q = residual.T @ residual / (known.sum() - x.shape[1])
+        np.testing.assert_allclose(model.innovation[b].numpy(), q + 1e-8 * np.eye(w), atol=1e-9)
+
+
+def test_ar_recovers_the_parameters_of_its_own_data() -> None:
+    data = simulate(movements=20, frames=400)
+    model = fitted(Autoregression, autoregression, data, coupling="vector")
+    past = np.concatenate([np.hstack([a[1:-1], a[:-2]]) for a in data.arrays])
+    q = ROOT_Q @ ROOT_Q.T
+    error = np.sqrt(np.outer(np.diag(q), np.diag(np.linalg.inv(len(past) * np.cov(past.T)))))
+    found = np.hstack(list(model.coefficients[:, 0].numpy()))
+    assert (np.abs(found - np.hstack([A_1, A_2])) < 6 * error).all()
+    tolerance = 6 * math.sqrt(2 / len(past)) * q.max()
+    np.testing.assert_allclose(model.innovation[0].numpy(), q, atol=tolerance)
+
+
+@pytest.mark.parametrize("coupling", ["channel", "vector"])
+def test_ar_forecast_moments_equal_simulation(coupling: str) -> None:
+    data = simulate()
+    model = fitted(Autoregression, autoregression, data, coupling=coupling)
+    horizon, count = 8, 20_000
+    seen = whole(data[:2].first(10))
+    torch.manual_seed(0)
+    answer = model.forecast(seen, None, horizon=horizon, draws=count)
+    full = torch.block_diag if coupling == "channel" else torch.squeeze
+    a, b = (full(*c) if coupling == "channel" else c[0] for c in model.coefficients)
+    q = full(*model.innovation) if coupling == "channel" else model.innovation[0]
+    root, rng = torch.linalg.cholesky(q), torch.Generator().manual_seed(1)
+    path = [seen.values[:, -2].expand(count, 2, 2), seen.values[:, -1].expand(count, 2, 2)]
+    for _ in range(horizon):
+        kick = torch.randn(count, 2, 2, generator=rng, dtype=torch.float64) @ root.T
+        path.append(model.intercept.flatten() + path[-1] @ a.T + path[-2] @ b.T + kick)
+    walked = torch.stack(path[2:], 2)
+    for draws in (walked, answer.draws):
+        error = answer.epistemic / math.sqrt(count)
+        assert bool(((draws.mean(0) - answer.location[0]).abs() < 6 * error).all())
+        ratio = draws.std(0) / answer.epistemic
+        assert bool(((ratio - 1).abs() < 6 / math.sqrt(2 * count)).all())
+    flat = walked[:, 0].flatten(1).T.corrcoef() - answer.draws[:, 0].flatten(1).T.corrcoef()
+    assert float(flat.abs().max()) < 6 * math.sqrt(2 / count)
+
+
+@pytest.mark.parametrize("coupling", ["channel", "vector"])
+def test_ar_imputation_equals_dense_gaussian_conditioning(coupling: str) -> None:
+    data = simulate()
+    model = fitted(Autoregression, autoregression, data, coupling=coupling)
+    holed = with_holes(data[:3].first(12), 0.3)
+    torch.manual_seed(0)
+    answer = model.impute(whole(holed), None, draws=20_000)
+    precision, shift = model._precision(12)
+    covariance = torch.linalg.inv(precision)
+    center = (covariance @ shift[..., None]).squeeze(-1)
+    seen = model._stacked(model._blocked(holed.mask))
+    values = model._stacked(model._blocked(holed.values))
+    location = model._stacked(model._blocked(answer.location[0]))
+    spread = model._stacked(model._blocked(answer.epistemic))
+    for i in range(3):
+        for k in range(model.blocks):
+            o, m = seen[i, k].nonzero()[:, 0], (~seen[i, k]).nonzero()[:, 0]
+            gain = covariance[k][m][:, o] @ torch.linalg.inv(covariance[k][o][:, o])
+            expected = center[k][m] + gain @ (values[i, k][o] - center[k][o])
+            rest = covariance[k][m][:, m] - gain @ covariance[k][o][:, m]
+            torch.testing.assert_close(location[i, k][m], expected, rtol=1e-7, atol=1e-8)
+            torch.testing.assert_close(spread[i, k][m], rest.diag().sqrt(), rtol=1e-7, atol=1e-8)
+            torch.testing.assert_close(location[i, k][o], values[i, k][o], rtol=0, atol=0)
+    ratio = (answer.draws.std(0) / answer.epistemic)[~holed.mask]
+    assert bool(((ratio - 1).abs() < 6 / math.sqrt(2 * 20_000)).all())
+
+
+def test_ar_forecast_from_its_last_frames_equals_that_from_all() -> None:
+    data = simulate()
+    model = fitted(Autoregression, autoregression, data)
+    seen = data[:3].first(9)
+    mask = seen.mask.clone()
+    mask[0, -2, 0] = False
+    holed = whole(replace(seen, mask=mask, values=torch.where(mask, seen.values, 0.0)))
+    some = model.forecast(holed, None, horizon=5, draws=2)
+    short = model.forecast(whole(seen), None, horizon=5, draws=2)
+    torch.testing.assert_close(some.location[:, 1:], short.location[:, 1:])
+    torch.testing.assert_close(some.epistemic[1:], short.epistemic[1:])
+    assert bool((some.epistemic[0, :2, 0] > short.epistemic[0, :2, 0]).all())
+
+
+def test_ar_program_has_the_density_of_the_dense_gaussian() -> None:
+    data = simulate()
+    model = fitted(Autoregression, autoregression, data, coupling="vector")
+    batch = whole(data[:4].first(15))
+    trace = poutine.trace(model).get_trace(batch)
+    precision, shift = model._precision(15)
+    center = torch.linalg.solve(precision[0], shift[0])
+    dense = torch.distributions.MultivariateNormal(center, precision_matrix=precision[0])
+    expected = dense.log_prob(batch.values.flatten(1)).sum()
+    torch.testing.assert_close(trace.log_prob_sum(), expected, rtol=1e-7, atol=0)
+
+
+def brute_force(
+    train: list[np.ndarray], query: np.ndarray, horizon: int, neighbours: int
+) -> list[np.ndarray]:
+    """Continuations of the nearest place of each of the nearest movements, by loops."""
+    context, best = len(query), []
+    for movement in train:
+        places = range(context, len(movement) - horizon + 1)
+        found = [(np.nanmean((movement[p - context : p] - query) ** 2), p) for p in places]
+        if found:
+            distance, place = min(found)
+            ahead = movement[place : place + horizon]
+            best.append((distance, ahead + query[-1] - movement[place - 1]))
+    return [b for _, b in sorted(best, key=lambda pair: pair[0])[:neighbours]]
+
+
+def test_nearest_neighbour_forecast_equals_brute_force() -> None:
+    data = simulate(movements=10)
+    model = fitted(NearestNeighbour, nearest_neighbour, data[:7], neighbours=3, context=4)
+    answer = model.forecast(whole(data[7:].first(12)), None, horizon=6, draws=1)
+    for i, query in enumerate(data[7:].first(12).arrays):
+        expected = brute_force(data[:7].arrays, query[-4:], 6, 3)
+        np.testing.assert_allclose(answer.location[:, i].numpy(), expected, atol=1e-10)
+
+
+def test_nearest_neighbour_spread_has_the_error_of_left_out_movements() -> None:
+    data = simulate(movements=8)
+    model = fitted(
+        NearestNeighbour, nearest_neighbour, data, neighbours=2, context=3, positions=100
+    )
+    error, spread = [], []
+    for i, movement in enumerate(data.arrays):
+        others = [a for j, a in enumerate(data.arrays) if j != i]
+        for place in range(3, len(movement) - 4):
+            ahead = len(movement) - place
+            if sum(len(o) - 3 >= ahead for o in others) < 2:
+                continue
+            near = np.array(brute_force(others, movement[place - 3 : place], ahead, 2))
+            error.append((movement[place + 4] - near.mean(0)[4]) ** 2)
+            spread.append(near.var(0)[4])
+    expected = np.maximum(np.mean(error, 0) - np.mean(spread, 0), np.mean(error, 0) / 4)
+    np.testing.assert_allclose(model.noise[4].square().numpy(), expected, rtol=0.1)
+
+
+def test_nearest_neighbour_finds_a_movement_that_it_knows() -> None:
+    data = simulate(movements=8)
+    model = fitted(NearestNeighbour, nearest_neighbour, data, neighbours=1)
+    future = model.forecast(whole(data[:1].first(12)), None, horizon=10, draws=1)
+    torch.testing.assert_close(future.location[0], data.values[:1, 12:22])
+    filled = model.impute(whole(with_holes(data[:3].first(20), 0.4)), None, draws=1)
+    torch.testing.assert_close(filled.location[0], data.values[:3, :20])
+
+
+def test_leaving_out_groups_widens_the_spread_of_a_group_that_repeats_itself() -> None:
+    rng = np.random.default_rng(0)
+    own = rng.normal(size=(4, 30, 2)).cumsum(1)
+    arrays = [own[i // 2] + 0.01 * rng.normal(size=(30, 2)) for i in range(8)]
+    groups = {"trial": range(8), "subject": [i // 2 for i in range(8)]}
+    data = Sequences.from_arrays(arrays, rate=30.0, groups=groups)
+    trial = fitted(NearestNeighbour, nearest_neighbour, data, neighbours=1)
+    subject = fitted(NearestNeighbour, nearest_neighbour, data, neighbours=1, leave_out="subject")
+    assert bool((subject.noise[:10] > 5 * trial.noise[:10]).all())
+
+
+def test_gaps_are_interpolated_as_numpy_does() -> None:
+    data = with_holes(simulate(), 0.4)
+    filled = interpolated(data.values, data.mask, torch.zeros(2).double())
+    time = np.arange(data.values.shape[1])
+    for i in range(len(data)):
+        for c in range(2):
+            known = data.mask[i, :, c].numpy()
+            expected = np.interp(time, time[known], data.values[i, known, c].numpy())
+            np.testing.assert_allclose(filled[i, :, c].numpy(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "home"), ALL)
+def test_forecasts_have_joint_draws_with_the_marginal_spread(kind, home) -> None:  # type: ignore[no-untyped-def]
+    data = simulate(movements=10)
+    model = fitted(kind, home, with_holes(data))
+    torch.manual_seed(0)
+    seen = whole(with_holes(data[:3].first(10)))
+    answer = prediction(model.forecast(seen, None, horizon=7, draws=4000), data)
+    draws = answer.sample(4000)
+    assert draws.shape == (4000, 3, 7, 2)
+    center = (draws.mean(0) - answer.mean).abs() / answer.std
+    assert float(center.max()) < 6 / math.sqrt(4000)
+    # A mixture's kurtosis is below 6 here: its standard deviation errs by less than twice the
+    # Gaussian's.
+    assert float((draws.std(0) / answer.std - 1).abs().max()) < 12 / math.sqrt(2 * 4000)
+
+
+@pytest.mark.parametrize(("kind", "home"), ALL)
+def test_what_is_missing_cannot_matter(kind, home) -> None:  # type: ignore[no-untyped-def]
+    data = with_holes(simulate())
+    poisoned = replace(data, values=torch.where(data.mask, data.values, 99.0))
+    first, second = fitted(kind, home, data), fitted(kind, home, poisoned)
+    for name, value in first.state_dict().items():
+        assert bool(value.isfinite().all())
+        assert torch.equal(value, second.state_dict()[name])
+    seen, wrong = whole(data.first(9)), whole(poisoned.first(9))
+    here, there = (
+        poutine.trace(m).get_trace(b).log_prob_sum() for m, b in ((first, seen), (first, wrong))
+    )
+    torch.testing.assert_close(here, there)
+    assert bool(here.isfinite())
+
+
+@pytest.mark.parametrize(("kind", "home"), ALL)
+def test_a_model_without_data_says_so(kind, home) -> None:  # type: ignore[no-untyped-def]
+    data = simulate()
+    model = kind(data.layout, home.Config())
+    with pytest.raises(NotFittedError, match="no data yet"):
+        model.forecast(whole(data.first(9)), None, horizon=2, draws=2)
+    with pytest.raises(TypeError, match="needs Sequences; got Pairs"):
+        model.condition(Pairs.from_arrays(np.zeros((3, 1)), np.zeros((3, 2))))
+    blind = replace(data, mask=data.mask & torch.tensor([True, False]))
+    with pytest.raises(ValueError, match="channel knee is missing in every frame"):
+        model.condition(blind)
+
+
+def test_too_little_data_is_named() -> None:
+    short = simulate(movements=1, frames=4)
+    with pytest.raises(ValueError, match=r"needs 4 runs of 3 frames .* channel hip has 2"):
+        fitted(Autoregression, autoregression, short)
+    with pytest.raises(ValueError, match="longer than its context of 5 frames; the longest has 4"):
+        fitted(NearestNeighbour, nearest_neighbour, short)
+    with pytest.raises(ValueError, match="at least 2 movements"):
+        fitted(NearestNeighbour, nearest_neighbour, simulate(movements=1))
+    with pytest.raises(ValueError, match="no group column 'day'; there are trial, subject"):
+        fitted(NearestNeighbour, nearest_neighbour, simulate(), leave_out="day")
+
+
+@pytest.mark.parametrize(
+    ("home", "settings", "message"),
+    [
+        (mean, {"noise_floor": 0.0}, "noise_floor must be positive"),
+        (last_value, {"noise_floor": -1.0}, "noise_floor must be positive"),
+        (autoregression, {"order": 0}, "order must be at least 1"),
+        (autoregression, {"coupling": "all"}, "coupling must be channel or vector"),
+        (autoregression, {"ridge": -1.0}, "ridge must not be negative"),
+        (nearest_neighbour, {"neighbours": 0}, "neighbours must be at least 1"),
+        (nearest_neighbour, {"decay": 0.0}, "decay must be positive"),
+    ],
+)
+def test_settings_without_a_meaning_are_refused(home, settings, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=message):
+        home.Config(**settings)

@@ -1,0 +1,64 @@
+"""What the sceptic's baselines share: checked training data, masked moments, the observed site."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from zoo.datasets.records import Pairs, Sequences
+from zoo.errors import NotFittedError
+from zoo.types import Batch
+
+__all__ = ["check_fitted", "moments", "movements_of", "observe", "seen_entries"]
+
+
+def movements_of(name: str, data: Sequences | Pairs, dtype: torch.dtype) -> Sequences:
+    """Training movements with 0 where nothing was seen; a channel never seen is refused by name."""
+    if not isinstance(data, Sequences):
+        raise TypeError(f"{name} needs Sequences; got {type(data).__name__}")
+    never = ~data.mask.any(1).any(0)
+    if never.any():
+        channel = data.channels[int(never.nonzero()[0])]
+        raise ValueError(f"channel {channel} is missing in every frame; drop it")
+    return replace(data, values=torch.where(data.mask, data.values, 0.0).to(dtype))
+
+
+def moments(values: Tensor, mask: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, standard deviation (n − 1) and count of the entries seen, over one axis.
+
+    >>> x = torch.tensor([[1.0, 3.0], [3.0, 0.0]])
+    >>> mean, deviation, count = moments(x, torch.tensor([[True, True], [True, False]]), 0)
+    >>> mean.tolist(), count.tolist()
+    ([2.0, 3.0], [2.0, 1.0])
+    """
+    count = mask.sum(dim).to(values)
+    mean = (values * mask).sum(dim) / count.clamp(min=1)
+    residual = (values - mean.unsqueeze(dim)) * mask
+    variance = residual.square().sum(dim) / (count - 1).clamp(min=1)
+    return mean, variance.sqrt(), count
+
+
+def seen_entries(batch: Batch) -> Bool[Tensor, "window time channel"]:
+    """The mask of a batch, spelled out where it is complete."""
+    if batch.mask is not None:
+        return batch.mask
+    return torch.ones_like(batch.values, dtype=torch.bool)
+
+
+def observe(batch: Batch, likelihood: dist.TorchDistribution) -> Tensor:
+    """The observed site ``x``: the seen entries of every window under ``likelihood``."""
+    with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
+        site = likelihood.mask(seen_entries(batch)).to_event(2)
+        x: Tensor = pyro.sample("x", site, obs=batch.values)
+    return x
+
+
+def check_fitted(name: str, buffer: Tensor) -> None:
+    """Raise a NotFittedError while ``buffer`` is still the empty placeholder."""
+    if buffer.numel() == 0:
+        raise NotFittedError(f"{name} has seen no data yet; call zoo.fit or condition first")
