@@ -9,7 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from zoo.catalogue import card, list_models
+    from zoo.cards import card
+    from zoo.catalogue import list_models
     from zoo.datasets.library import list_data, load_data
     from zoo.datasets.records import Pairs, Sequences
     from zoo.evaluation.table import Table
@@ -41,7 +42,7 @@ _HOME = {
     "Run": "zoo.run",
     "Sequences": "zoo.datasets.records",
     "Table": "zoo.evaluation.table",
-    "card": "zoo.catalogue",
+    "card": "zoo.cards",
     "create": "zoo.run",
     "evaluate": "zoo.run",
     "fit": "zoo.run",

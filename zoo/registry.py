@@ -16,8 +16,9 @@ from typing import Any, Literal
 from zoo.errors import UnknownNameError
 from zoo.strategies import Inference
 
-__all__ = ["CAPABILITIES", "Entry", "Registry"]
+__all__ = ["CAPABILITIES", "Entry", "Registry", "Scaling", "load"]
 
+Scaling = Literal["standard", "center", "range", "none"]
 CAPABILITIES = ("regress", "represent", "reconstruct", "forecast", "impute", "generate", "act")
 
 
@@ -37,7 +38,7 @@ class Entry:
     inference: Inference
     data: Literal["sequences", "pairs"]
     dataset: str
-    scaling: Literal["standard", "center", "range", "none"] = "standard"
+    scaling: Scaling = "standard"
     config: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -90,13 +90,14 @@ class Batch:
         return int(self.values.shape[0])
 
     def repeat(self, times: int) -> Self:
-        """Every window ``times`` times over, the copies of the whole batch one after the other."""
+        """``times`` copies of the whole batch, one after the other, each with its own movements."""
         tiled: dict[str, Any] = {
-            f.name: torch.cat([getattr(self, f.name)] * times)
+            f.name: torch.cat([value] * times)
             for f in fields(self)
-            if f.name in ("values", "mask", "inputs", "start", "sequence")
-            and getattr(self, f.name) is not None
+            if isinstance(value := getattr(self, f.name), Tensor)
         }
+        shift = torch.arange(times, device=self.sequence.device) * self.movements.shape[0]
+        tiled["sequence"] = (self.sequence + shift[:, None]).flatten()
         return replace(self, **tiled)
 
 

@@ -1,0 +1,69 @@
+"""Skeleton of a generative model: copy to ``zoo/models/NAME.py`` and put your mathematics in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from zoo.prediction import Predictive
+from zoo.types import Batch, Layout, Posterior
+
+__all__ = ["Config", "FactorModel"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Settings of the model; every field can be set by ``zoo.create(name, data, field=…)``."""
+
+    latent_dim: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built, and name it."""
+        if self.latent_dim < 1:
+            raise ValueError(f"latent_dim must be at least 1; got {self.latent_dim}")
+
+
+class FactorModel(nn.Module):
+    """Factor analysis of single frames.
+
+    z_t ~ N(0, I),  x_t ~ N(W z_t + μ, diag σ²),
+
+    with z_t the latent state of frame t and σ a learned standard deviation per channel. Write the
+    equations of your model here, in the symbols of its paper, with the section of the thesis that
+    it comes from, its defaults, and what it cannot give: this docstring is the model's card.
+    """
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float32
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """Parameters for data of ``layout``; they are initialised from the seed of the assembly."""
+        super().__init__()
+        self.layout, self.config = layout, config
+        self.latent_dim = config.latent_dim
+        self.decoder = nn.Linear(config.latent_dim, len(layout.channels))
+        self.log_scale = nn.Parameter(torch.zeros(len(layout.channels)))
+
+    def forward(self, batch: Batch) -> None:
+        """p(x, z): the Pyro program; a plate of the whole size scales a minibatch rightly."""
+        shape = (*batch.values.shape[:2], self.latent_dim)
+        with pyro.plate("windows", batch.total, subsample=torch.arange(len(batch))):
+            prior = dist.Normal(batch.values.new_zeros(shape), 1.0).to_event(2)
+            z = pyro.sample("z", prior)
+            likelihood = dist.Normal(self.decoder(z), self.log_scale.exp())
+            if batch.mask is not None:
+                likelihood = likelihood.mask(batch.mask)
+            pyro.sample("x", likelihood.to_event(2), obs=batch.values)
+
+    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """p(x̂ | x): a capability is a method; the zoo finds it by its name."""
+        if posterior is None:
+            raise ValueError("reconstruct needs the guide's posterior")
+        z: Float[Tensor, "sample sequence time latent"] = posterior.draw(batch, draws)["z"]
+        return Predictive(location=self.decoder(z), noise=self.log_scale.exp(), joint=True)

@@ -1,0 +1,131 @@
+"""Folders of safetensors and JSON with a format version and a hash: written whole or not at all.
+
+The tensors go into a file named by their own hash; the JSON that names it is replaced last, in one
+step. A crash at any moment leaves the old folder or the new one, never a mixture.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from zoo.errors import DamagedRunError
+
+__all__ = ["read", "replace_file", "restore", "state_of", "write"]
+
+
+def write(
+    folder: Path,
+    stem: str,
+    meta: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    *,
+    version: int,
+) -> None:
+    """Write ``stem.json`` and its tensors into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    payload = save_tensors({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()})
+    digest = hashlib.sha256(payload).hexdigest()
+    name = f"{stem}-{digest[:16]}.safetensors"
+    head = {"format": f"movezoo-{stem}", "version": version, "tensors": name, "sha256": digest}
+    text = json.dumps({**head, **meta}, indent=1, allow_nan=False)
+    replace_file(folder / name, payload)
+    replace_file(folder / f"{stem}.json", text.encode())
+    for old in folder.glob(f"{stem}-*.safetensors"):
+        if old.name != name:
+            old.unlink(missing_ok=True)
+
+
+def read(folder: Path, stem: str, *, version: int) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read what :func:`write` wrote; a damaged, foreign or newer folder is refused."""
+    meta = _meta(folder / f"{stem}.json", stem, version)
+    file = folder / Path(str(meta.get("tensors"))).name
+    if not file.is_file():
+        raise DamagedRunError(f"{folder}: {file.name} is missing")
+    payload = file.read_bytes()
+    if hashlib.sha256(payload).hexdigest() != meta.get("sha256"):
+        raise DamagedRunError(f"{file}: the hash differs from the one in {stem}.json")
+    try:
+        return meta, load_tensors(payload)
+    except SafetensorError as error:
+        raise DamagedRunError(f"{file}: not a safetensors file: {error}") from None
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Put ``content`` at ``path`` in one step that survives a crash."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    with open(partial, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+def state_of(**modules: nn.Module | None) -> dict[str, Tensor]:
+    """Parameters and buffers of the modules, each under ``module.name``."""
+    return {
+        f"{prefix}.{key}": value
+        for prefix, module in modules.items()
+        if module is not None
+        for key, value in module.state_dict().items()
+    }
+
+
+def restore(module: nn.Module, prefix: str, tensors: Mapping[str, Tensor]) -> None:
+    """Load ``prefix.*`` into a module; statistics may take whatever shape the data gave them."""
+    mine = {
+        k.removeprefix(f"{prefix}."): v for k, v in tensors.items() if k.startswith(f"{prefix}.")
+    }
+    expected = module.state_dict()
+    if set(mine) != set(expected):
+        odd = sorted(set(mine) ^ set(expected))
+        raise DamagedRunError(f"{prefix} and the saved state differ in {', '.join(odd[:5])}")
+    parameters = dict(module.named_parameters())
+    for key, value in mine.items():
+        target = expected[key]
+        if key in parameters and target.numel() and target.shape != value.shape:
+            raise DamagedRunError(
+                f"{prefix}.{key} has shape {tuple(value.shape)}; {tuple(target.shape)} is needed"
+            )
+        _put(module, key, value.to(device=target.device, dtype=target.dtype), key in parameters)
+
+
+def _put(module: nn.Module, key: str, value: Tensor, trainable: bool) -> None:
+    path, _, name = key.rpartition(".")
+    owner = module.get_submodule(path)
+    with torch.no_grad():
+        if trainable:
+            getattr(owner, name).data = value
+        else:
+            owner._buffers[name] = value
+
+
+def _meta(path: Path, stem: str, version: int) -> dict[str, Any]:
+    if not path.is_file():
+        raise DamagedRunError(f"{path.parent} holds no {path.name}: it is not a movezoo {stem}")
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DamagedRunError(f"{path}: not JSON: {error}") from None
+    if not isinstance(meta, dict) or meta.get("format") != f"movezoo-{stem}":
+        raise DamagedRunError(f"{path} is not a movezoo {stem}")
+    if meta.get("version") != version:
+        raise DamagedRunError(
+            f"{path} has format version {meta.get('version')}; this movezoo reads {version}"
+        )
+    return meta

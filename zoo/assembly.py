@@ -1,0 +1,153 @@
+"""A model, a guide and an inference strategy bound to the layout of some data, not yet trained."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, get_args
+
+import torch
+from pydantic import TypeAdapter, ValidationError
+from torch import nn
+
+from zoo.catalogue import CATALOGUE
+from zoo.datasets.records import Pairs, Sequences
+from zoo.errors import UnknownNameError
+from zoo.inference.posterior import seeded
+from zoo.registry import Entry, Scaling, load
+from zoo.strategies import Inference
+from zoo.types import Layout
+
+__all__ = ["Assembly", "assemble", "create", "options"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembly:
+    """What ``zoo.create`` returns: everything that training needs but the data.
+
+    ``settings`` are the keywords that the user gave; with the entry, the layout and the seed they
+    determine the initial parameters bit for bit.
+    """
+
+    entry: Entry
+    layout: Layout
+    model: nn.Module
+    guide: nn.Module | None
+    inference: Inference
+    settings: Mapping[str, Any]
+    scaling: Scaling
+    seed: int
+    device: str
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Number type that the model computes in."""
+        return self.model.dtype  # type: ignore[return-value]
+
+    def parameters(self) -> int:
+        """Number of trainable numbers in model and guide."""
+        modules = [self.model] + ([] if self.guide is None else [self.guide])
+        return sum(p.numel() for m in modules for p in m.parameters())
+
+
+def create(
+    name: str,
+    data: Sequences | Pairs,
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    **settings: Any,
+) -> Assembly:
+    """Bind the entry ``name`` to the layout of ``data``; keywords override its settings.
+
+    Every keyword goes to each part that has a field of that name: the model's and the guide's
+    ``Config`` and the inference strategy. An unknown keyword or model lists the nearest names.
+
+    >>> import numpy as np, zoo
+    >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
+    >>> zoo.create("pca", data, latent_dim=2).model.config.latent_dim
+    2
+    """
+    return assemble(CATALOGUE[name], data.layout, settings, seed=seed, device=device)
+
+
+def assemble(
+    entry: Entry, layout: Layout, settings: Mapping[str, Any], *, seed: int, device: str
+) -> Assembly:
+    """Build model and guide of ``entry`` for ``layout`` from a seed."""
+    if layout.kind != entry.data:
+        raise ValueError(f"{entry.name} needs {entry.data}; got {layout.kind}")
+    known = options(entry)
+    for key in settings:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or sorted(known)
+            raise UnknownNameError(
+                f"{entry.name} has no setting {key!r}; nearest: {', '.join(near)}"
+            )
+    values = {**entry.config, **settings}
+    model_class = load(entry.model)
+    guide_class = None if entry.guide is None else load(entry.guide)
+    with seeded(seed):
+        model = model_class(layout, _config(entry, model_class.config_class, values))
+        guide = None
+        if guide_class is not None:
+            guide = guide_class(layout, model, _config(entry, guide_class.config_class, values))
+    model = model.to(device=device, dtype=model_class.dtype)
+    guide = None if guide is None else guide.to(device=device, dtype=model_class.dtype)
+    return Assembly(
+        entry=entry,
+        layout=layout,
+        model=model,
+        guide=guide,
+        inference=_strategy(entry, values),
+        settings=dict(settings),
+        scaling=_scaling(values.get("scaling", entry.scaling)),
+        seed=seed,
+        device=device,
+    )
+
+
+def options(entry: Entry) -> dict[str, tuple[str, Any, Any]]:
+    """Settings of an entry: name → (part, type, default), from the parts' own dataclasses."""
+    found: dict[str, tuple[str, Any, Any]] = {}
+    for part, path in (("guide", entry.guide), ("model", entry.model)):
+        if path is not None:
+            for field in dataclasses.fields(load(path).config_class):
+                default = entry.config.get(field.name, field.default)
+                found[field.name] = (part, field.type, default)
+    for field in dataclasses.fields(entry.inference):
+        found[field.name] = ("inference", field.type, getattr(entry.inference, field.name))
+    found["scaling"] = ("data", Scaling, entry.scaling)
+    return found
+
+
+def _scaling(kind: Any) -> Scaling:
+    if kind not in get_args(Scaling):
+        raise ValueError(f"scaling is one of {', '.join(get_args(Scaling))}; got {kind!r}")
+    scaling: Scaling = kind
+    return scaling
+
+
+def _config(entry: Entry, kind: type, values: Mapping[str, Any]) -> Any:
+    names = {f.name for f in dataclasses.fields(kind)}
+    return _validated(entry, kind, {k: v for k, v in values.items() if k in names})
+
+
+def _strategy(entry: Entry, values: Mapping[str, Any]) -> Inference:
+    kept = dataclasses.asdict(entry.inference)
+    kept.update({k: v for k, v in values.items() if k in kept})
+    strategy: Inference = _validated(entry, type(entry.inference), kept)
+    return strategy
+
+
+def _validated(entry: Entry, kind: type, values: Mapping[str, Any]) -> Any:
+    try:
+        return TypeAdapter(kind).validate_python(dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(p) for p in first["loc"]) or kind.__name__
+        raise ValueError(
+            f"{entry.name}: setting {where}: {first['msg']}; got {first.get('input')!r}"
+        ) from None

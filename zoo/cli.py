@@ -1,0 +1,229 @@
+"""Command line of the zoo: look, fit, evaluate, forecast, and reproduce an experiment."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+if TYPE_CHECKING:
+    from zoo.datasets.records import Pairs, Sequences
+    from zoo.run import Run
+
+__all__ = ["app", "main"]
+
+EXIT_CODES = """Exit codes: 0 done; 1 training or reading failed; 2 a wrong argument, name or data
+set; 130 interrupted (checkpoints are kept: repeat the command with --resume)."""
+
+app = typer.Typer(
+    name="zoo",
+    help="A probabilistic programming model zoo for movement.\n\n"
+    "Start with `zoo list`, read `zoo card vae-dmp`, then `zoo fit vae-dmp --run-dir runs/first` "
+    "and `zoo evaluate runs/first`.",
+    epilog=EXIT_CODES,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+Data = Annotated[
+    str | None,
+    typer.Option("--data", help="Data set by name (see `zoo data`); default: the model's own."),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="KEY=VALUE, a setting of the model; repeatable (see `zoo card`)."),
+]
+Folder = Annotated[Path, typer.Argument(help="Folder of a run that `zoo fit` wrote.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of split, parameters and noise.")]
+Figure = Annotated[Path | None, typer.Option("--figure", help="Write a figure to this PNG.")]
+
+
+@app.command("list")
+def list_command(
+    pattern: Annotated[str, typer.Argument(help="Glob, e.g. '*dmp*'.")] = "*",
+    can: Annotated[str | None, typer.Option("--can", help="Only models with this task.")] = None,
+    json: Json = False,
+    markdown: Annotated[bool, typer.Option(help="Print the table as Markdown.")] = False,
+) -> None:
+    """Models by name, with what they can do."""
+    from zoo.catalogue import CATALOGUE
+    from zoo.console import models_markdown, models_table, print_json
+
+    entries = [CATALOGUE[name] for name in CATALOGUE.names(pattern, can=can)]
+    if json:
+        rows = [
+            {"name": e.name, "summary": e.summary, "thesis": e.thesis, "can": e.capabilities}
+            for e in entries
+        ]
+        print_json(rows)
+    elif markdown:
+        print(models_markdown(entries))
+    else:
+        Console().print(models_table(entries))
+
+
+@app.command()
+def card(name: Annotated[str, typer.Argument(help="Name of a model.")], json: Json = False) -> None:
+    """One model in full: mathematics, thesis section, settings and measured results."""
+    from zoo.cards import card as make_card
+    from zoo.console import print_json
+
+    found = make_card(name)
+    if json:
+        print_json(found.to_json())
+    else:
+        Console().print(found)
+
+
+@app.command()
+def data(
+    name: Annotated[str | None, typer.Argument(help="Name of a data set; none lists all.")] = None,
+    folder: Annotated[Path | None, typer.Option(help="Where the files are.")] = None,
+    json: Json = False,
+) -> None:
+    """Data sets by name, or one described: movements, frames, rate, channels, groups."""
+    from zoo.console import data_table, describe, print_json
+    from zoo.datasets.library import list_data, load_data
+
+    if name is None:
+        names = list_data()
+        print_json(names) if json else Console().print(data_table(names))
+        return
+    description = describe(load_data(name, folder=folder))
+    print_json(description) if json else Console().print(data_table(description))
+
+
+@app.command()
+def fit(
+    model: Annotated[str, typer.Argument(help="Name of a model (see `zoo list`).")],
+    run_dir: Annotated[Path, typer.Option(help="Folder for checkpoints and the run.")],
+    data: Data = None,
+    settings: Settings = None,
+    by: Annotated[str | None, typer.Option(help="Group column to split by.")] = None,
+    parts: Annotated[str, typer.Option(help="train,val,calib,test shares.")] = ".6,.1,.15,.15",
+    seed: Seed = 0,
+    calibrate: Annotated[str, typer.Option(help="conformal, isotonic, scale or none.")] = (
+        "conformal"
+    ),
+    resume: Annotated[bool, typer.Option(help="Continue from a checkpoint in the folder.")] = False,
+    device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    json: Json = False,
+) -> None:
+    """Train a model on four-way split data and calibrate its spreads on movements unseen.
+
+    Example: `zoo fit vae-dmp --data cmu-mocap/35-walk --set latent_dim=5 --run-dir runs/walk`
+    """
+    from zoo.workflow import Plan, train
+
+    plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device)
+    with _interruptible():
+        run = train(plan, run_dir, resume=resume, progress=not json)
+    _report(run, plan.load()[3], json=json)
+    if not json:
+        Console().print(f"Run written to [bold]{run_dir}[/]; next: zoo evaluate {run_dir}")
+
+
+@app.command()
+def evaluate(
+    run_dir: Folder,
+    data: Data = None,
+    task: Annotated[list[str] | None, typer.Option(help="Only this task; repeatable.")] = None,
+    figure: Figure = None,
+    json: Json = False,
+) -> None:
+    """Scores of a run on its test part, or on all of another data set: errors and calibration."""
+    from zoo.workflow import open_run, reliability_figure
+
+    run, test = open_run(run_dir, data)
+    _report(run, test, json=json, tasks=task)
+    if figure is not None:
+        reliability_figure(run, test, figure)
+
+
+@app.command()
+def forecast(
+    run_dir: Folder,
+    data: Data = None,
+    seen: Annotated[int | None, typer.Option(help="Frames shown to the model.")] = None,
+    horizon: Annotated[int | None, typer.Option(help="Frames to forecast.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Write mean and bands to this CSV.")] = None,
+    figure: Figure = None,
+    json: Json = False,
+) -> None:
+    """Forecast the test movements of a run with calibrated bands; print, write or draw them."""
+    from zoo.workflow import forecast_report, open_run
+
+    run, test = open_run(run_dir, data)
+    report = forecast_report(run, test, seen=seen, horizon=horizon, output=output, figure=figure)
+    if json:
+        from zoo.console import print_json
+
+        print_json(report.to_json())
+    else:
+        Console().print(report)
+
+
+@app.command()
+def experiment(
+    identifier: Annotated[
+        str | None, typer.Argument(help="Id, e.g. E6.1; none lists all.", metavar="ID")
+    ] = None,
+    output: Annotated[Path, typer.Option(help="Folder for table and figure.")] = Path("results"),
+    quick: Annotated[bool, typer.Option(help="A short training, to see that it runs.")] = False,
+    json: Json = False,
+) -> None:
+    """Reproduce an experiment of the thesis: its table and figure beside the printed ones."""
+    from zoo.console import data_table, print_json
+    from zoo.experiments import EXPERIMENTS, run_experiment
+
+    if identifier is None:
+        listing = {k: e.summary for k, e in EXPERIMENTS.items()}
+        print_json(listing) if json else Console().print(data_table(listing))
+        return
+    with _interruptible():
+        result = run_experiment(identifier, output, quick=quick, progress=not json)
+    print_json(result.to_json()) if json else Console().print(result)
+
+
+def _report(
+    run: Run, test: Pairs | Sequences, *, json: bool, tasks: list[str] | None = None
+) -> None:
+    from zoo.console import print_json
+    from zoo.run import evaluate as score
+
+    table = score(run, test, tasks=tasks)
+    print_json(table.to_json()) if json else Console().print(table)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("zoo: interrupted; repeat the command with --resume to go on", file=sys.stderr)
+        raise typer.Exit(130) from None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; what the user can mend is one line on stderr, not a traceback."""
+    from zoo.errors import DamagedRunError, TrainingError
+
+    try:
+        app(arguments)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    except (DamagedRunError, TrainingError, OSError, FloatingPointError) as error:
+        print(f"zoo: {error}", file=sys.stderr)
+        return 1
+    except (ValueError, TypeError, LookupError) as error:
+        print(f"zoo: {error}", file=sys.stderr)
+        return 2
+    return 0

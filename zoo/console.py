@@ -1,0 +1,89 @@
+"""What the command line prints: tables for people, JSON for machines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from zoo.datasets.records import Pairs, Sequences
+    from zoo.registry import Entry
+
+__all__ = ["data_table", "describe", "models_markdown", "models_table", "print_json"]
+
+
+def print_json(value: Any) -> None:
+    """One JSON document on standard output."""
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def models_table(entries: Iterable[Entry]) -> Table:
+    """Entries with their tasks, a line each."""
+    table = Table("model", "what it is", "can", box=None, pad_edge=False)
+    for entry in entries:
+        table.add_row(
+            f"[bold]{entry.name}[/]",
+            f"{entry.summary} [dim]({entry.thesis}, {type(entry.inference).__name__})[/]",
+            " ".join(entry.capabilities),
+        )
+    return table
+
+
+def models_markdown(entries: Iterable[Entry]) -> str:
+    """Entries as a Markdown table, for the README."""
+    lines = ["| model | what it is | thesis | inference | can |", "|---|---|---|---|---|"]
+    lines += [
+        f"| `{e.name}` | {e.summary} | {e.thesis} | {type(e.inference).__name__} | "
+        f"{', '.join(e.capabilities)} |"
+        for e in entries
+    ]
+    return "\n".join(lines)
+
+
+def data_table(rows: Mapping[str, Any] | Sequence[str]) -> Table:
+    """Names and values, a line each."""
+    table = Table(box=None, show_header=False)
+    if isinstance(rows, Mapping):
+        for key, value in rows.items():
+            table.add_row(f"[bold]{key}[/]", str(value))
+    else:
+        for name in rows:
+            table.add_row(name)
+    return table
+
+
+def describe(data: Pairs | Sequences) -> dict[str, Any]:
+    """What a data set holds, in words and numbers."""
+    layout = data.layout
+    description: dict[str, Any] = {"name": data.name, "provenance": data.provenance}
+    if layout.kind == "sequences":
+        lengths = data.lengths.tolist()  # type: ignore[union-attr]
+        description |= {
+            "movements": len(data),
+            "frames": f"{min(lengths)}–{max(lengths)}",
+            "rate": f"{layout.rate:g} Hz",
+        }
+    else:
+        description |= {"items": len(data), "features": len(layout.inputs)}
+    description |= {
+        "channels": f"{len(layout.channels)}: {_shortened(layout.channels)}",
+        "units": _shortened(tuple(dict.fromkeys(layout.units))),
+        "missing": f"{1 - _present(data):.1%}",
+        "groups": {k: _shortened(tuple(dict.fromkeys(v))) for k, v in data.groups.items()},
+    }
+    return description
+
+
+def _present(data: Pairs | Sequences) -> float:
+    from zoo.datasets.records import Sequences
+
+    if not isinstance(data, Sequences):
+        return float(data.mask.double().mean())
+    return float(data.mask.sum() / (data.lengths.sum() * len(data.channels)))
+
+
+def _shortened(names: Sequence[str], count: int = 6) -> str:
+    return ", ".join(names[:count]) + (f", … ({len(names)})" if len(names) > count else "")

@@ -1,0 +1,125 @@
+"""What an experiment is and what it leaves behind: Markdown, JSON and a figure."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.markdown import Markdown
+
+from zoo.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["EXPERIMENTS", "Experiment", "Result", "run_experiment"]
+
+Source = Literal["thesis", "public", "simulated"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """An experiment by id; ``module`` has ``run(*, quick, progress) -> Result``."""
+
+    summary: str
+    module: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Rows of numbers with their reference, prose that says what they show, and a figure.
+
+    ``cards`` are the sentences that model cards quote; ``source`` says what the data are.
+    """
+
+    title: str
+    source: Source
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    findings: tuple[str, ...]
+    seed: int
+    details: Mapping[str, Any] = field(default_factory=dict)
+    cards: Sequence[Mapping[str, Any]] = ()
+    figure: Figure | None = None
+    identifier: str = ""
+    seconds: float = 0.0
+
+    def markdown(self) -> str:
+        """The table and the findings."""
+        head = f"# {self.identifier}: {self.title}\n\nData: {self.source}.\n"
+        lines = ["| " + " | ".join(self.columns) + " |", "|" + "---|" * len(self.columns)]
+        lines += ["| " + " | ".join(_cell(c) for c in row) + " |" for row in self.rows]
+        findings = "\n".join(f"- {f}" for f in self.findings)
+        return f"{head}\n" + "\n".join(lines) + f"\n\n{findings}\n"
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the figure as plain data, with versions and duration."""
+        return {
+            "id": self.identifier,
+            "title": self.title,
+            "source": self.source,
+            "command": f"zoo experiment {self.identifier}",
+            "seed": self.seed,
+            "seconds": round(self.seconds, 1),
+            "columns": list(self.columns),
+            "rows": [list(r) for r in self.rows],
+            "findings": list(self.findings),
+            "details": dict(self.details),
+            "cards": [
+                {**c, "source": self.source, "command": f"zoo experiment {self.identifier}"}
+                for c in self.cards
+            ],
+            "versions": {n: version(n) for n in ("movezoo", "torch", "pyro-ppl", "numpy")},
+            "machine": {"cores": os.cpu_count(), "python": platform.python_version()},
+        }
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table for a terminal."""
+        yield Markdown(self.markdown())
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    "E6.1": Experiment(
+        summary="five movements in one VAE-DMP and each in its own, against Table 2 and Fig. 45",
+        module="zoo.experiments.e6_1",
+    ),
+}
+
+
+def run_experiment(
+    identifier: str, output: Path, *, quick: bool = False, progress: bool = False
+) -> Result:
+    """Run an experiment and write ``ID.md``, ``ID.json`` and ``ID.png`` into ``output``."""
+    if identifier not in EXPERIMENTS:
+        near = difflib.get_close_matches(identifier, EXPERIMENTS, n=3) or list(EXPERIMENTS)
+        raise UnknownNameError(f"no experiment {identifier!r}; nearest: {', '.join(near)}")
+    run: Callable[..., Result] = import_module(EXPERIMENTS[identifier].module).run
+    began = time.monotonic()
+    found = run(quick=quick, progress=progress)
+    result = replace(found, identifier=identifier, seconds=time.monotonic() - began)
+    _write(result, output)
+    return result
+
+
+def _write(result: Result, output: Path) -> None:
+    output.mkdir(parents=True, exist_ok=True)
+    stem = output / result.identifier
+    stem.with_name(f"{result.identifier}.md").write_text(result.markdown(), encoding="utf-8")
+    text = json.dumps(result.to_json(), indent=1, allow_nan=False)
+    stem.with_name(f"{result.identifier}.json").write_text(text + "\n", encoding="utf-8")
+    if result.figure is not None:
+        result.figure.savefig(stem.with_name(f"{result.identifier}.png"), dpi=150)
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

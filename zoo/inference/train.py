@@ -1,0 +1,135 @@
+"""One call for every strategy: closed form, marginal likelihood or stochastic variational."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+
+from zoo.datasets.records import Pairs, Sequences
+from zoo.inference.loader import whole
+from zoo.inference.marginal import fit_marginal
+from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.svi import fit_svi
+from zoo.strategies import Exact, Inference, MarginalLikelihood, Svi
+from zoo.types import Batch, Posterior
+
+__all__ = ["Conditions", "LearnsPrior", "MaximisesEvidence", "Session", "train_model"]
+
+
+@runtime_checkable
+class Conditions(Protocol):
+    """Exact inference: the statistics of the training data are all there is to learn."""
+
+    def condition(self, data: Sequences | Pairs) -> None:
+        """Store what prediction needs in buffers."""
+        ...
+
+
+@runtime_checkable
+class MaximisesEvidence(Conditions, Protocol):
+    """Type-II maximum likelihood over the model's parameters."""
+
+    def objective(self) -> Tensor:
+        """Negative log evidence of the data last given to ``condition``."""
+        ...
+
+
+@runtime_checkable
+class LearnsPrior(Protocol):
+    """A prior over whole movements, estimated from the trained guide (empirical Bayes)."""
+
+    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
+        """Store the aggregate of the training movements' latents in buffers."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Session:
+    """How a training is run: seed, device, where its checkpoints are, and what it shows."""
+
+    seed: int = 0
+    device: str = "cpu"
+    folder: Path | None = None
+    resume: Literal["never", "auto", "must"] = "never"
+    progress: bool = False
+    tensorboard: bool = False
+
+
+def train_model(
+    model: nn.Module,
+    guide: nn.Module | None,
+    strategy: Inference,
+    train: Sequences | Pairs,
+    val: Sequences | Pairs | None,
+    session: Session,
+) -> list[dict[str, Any]]:
+    """Train ``model`` and ``guide`` in place on scaled data; returns the history's rows."""
+    history = _TRAINERS[type(strategy)](model, guide, strategy, train, val, session)
+    model.eval()
+    if guide is not None:
+        guide.eval()
+    if guide is not None and isinstance(model, LearnsPrior):
+        with seeded(session.seed, session.device), torch.no_grad():
+            model.learn_prior(whole(train), GuidePosterior(guide))
+    return history
+
+
+def _exact(
+    model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
+) -> list[dict[str, Any]]:
+    _need(model, Conditions)
+    model.condition(train)
+    return []
+
+
+def _marginal(
+    model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
+) -> list[dict[str, Any]]:
+    _need(model, MaximisesEvidence)
+    return fit_marginal(
+        model,
+        train,
+        strategy,
+        seed=session.seed,
+        progress=session.progress,
+        folder=session.folder,
+        resume=session.resume,
+    )
+
+
+def _variational(
+    model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
+) -> list[dict[str, Any]]:
+    if guide is None:
+        raise TypeError(f"{type(model).__name__} has no guide to train by variational inference")
+    history = fit_svi(
+        model,
+        guide,
+        train,
+        strategy,
+        val=val,
+        seed=session.seed,
+        device=session.device,
+        folder=session.folder,
+        resume=session.resume,
+        progress=session.progress,
+        tensorboard=session.tensorboard,
+    )
+    return history.rows
+
+
+def _need(model: nn.Module, protocol: type) -> None:
+    if not isinstance(model, protocol):
+        raise TypeError(f"{type(model).__name__} lacks what {protocol.__name__} asks for")
+
+
+_TRAINERS: dict[type, Callable[..., list[dict[str, Any]]]] = {
+    Exact: _exact,
+    MarginalLikelihood: _marginal,
+    Svi: _variational,
+}

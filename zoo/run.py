@@ -1,0 +1,407 @@
+"""A trained model with everything it needs to predict: fit, predict, calibrate, save and load."""
+
+from __future__ import annotations
+
+import copy
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+
+from zoo.assembly import Assembly, create
+from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.scaling import Scaler
+from zoo.errors import NotCapableError
+from zoo.evaluation.calibration import recalibrate
+from zoo.evaluation.scores import score
+from zoo.evaluation.table import Table
+from zoo.inference.loader import whole
+from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.train import Session, train_model
+from zoo.prediction import Prediction, Predictive, Recalibration
+from zoo.tasks import Setup, Trial, trials
+from zoo.types import Batch, Posterior
+
+__all__ = ["Run", "create", "evaluate", "fit", "load"]
+
+Resume = Literal["never", "auto", "must"]
+Method = Literal["conformal", "isotonic", "scale"]
+Answer = Callable[[Batch, Posterior | None], Predictive]
+
+
+@dataclass(kw_only=True)
+class Run:
+    """A trained model: predictions in the data's own units, calibration, saving.
+
+    ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
+    ``seen`` the group rows of the training data, so that an evaluation on them is noticed.
+    """
+
+    assembly: Assembly
+    scaler: Scaler
+    history: list[dict[str, Any]]
+    seconds: float
+    trained_on: dict[str, Any]
+    recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name of the entry."""
+        return self.assembly.entry.name
+
+    @property
+    def model(self) -> nn.Module:
+        """The trained generative model."""
+        return self.assembly.model
+
+    @property
+    def capabilities(self) -> tuple[str, ...]:
+        """Tasks that the model can do."""
+        return self.assembly.entry.capabilities
+
+    def forecast(
+        self, data: Sequences, *, horizon: int, draws: int = 200, seed: int = 0
+    ) -> Prediction:
+        """The ``horizon`` frames after the movements in ``data``, which hold the frames seen."""
+        if horizon < 1:
+            raise ValueError(f"horizon must be at least 1 frame; got {horizon}")
+        forecast = self._capability("forecast")
+
+        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+            return forecast(batch, posterior, horizon=horizon, draws=draws)
+
+        prediction = self._predict("forecast", data, answer, seed)
+        return replace(prediction, offset=int(data.lengths.max()), lengths=None)
+
+    def reconstruct(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """The movements as the model reproduces them."""
+        return self._simple("reconstruct", data, draws, seed)
+
+    def impute(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """All entries of the movements, those missing (NaN in the arrays) filled in."""
+        return self._simple("impute", data, draws, seed)
+
+    def represent(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """Latent trajectories of the movements."""
+        represent = self._capability("represent")
+
+        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+            return represent(batch, posterior, draws=draws)
+
+        latent = self._answer(data, answer, seed)
+        count = latent.location.shape[-1]
+        return Prediction(
+            predictive=latent,
+            axes=("sequence", "time", "latent"),
+            names=tuple(f"z_{i + 1}" for i in range(count)),
+            units=("",) * count,
+            task="represent",
+            rate=data.rate,
+            lengths=data.lengths,
+        )
+
+    def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """Targets of new inputs, given as Pairs or as an array (item, feature)."""
+        regress = self._capability("regress")
+        pairs = self._scaled(self._as_pairs(data))
+        with seeded(seed, self.assembly.device), torch.no_grad():
+            predictive = regress(pairs.inputs, draws=draws)
+        layout = self.assembly.layout
+        return Prediction(
+            predictive=self._unscaled(predictive, "regress"),
+            axes=("item", "target"),
+            names=layout.channels,
+            units=layout.units,
+            task="regress",
+            recalibration=self.recalibrations.get("regress"),
+        )
+
+    def generate(
+        self,
+        like: Sequences,
+        *,
+        goal: ArrayLike | None = None,
+        duration: float = 1.0,
+        onto: Sequences | None = None,
+        start: int = 0,
+        steps: int = 1,
+        draws: int = 200,
+        seed: int = 0,
+    ) -> Prediction:
+        """New movements after the demonstrations ``like``.
+
+        ``goal`` is the last frame to reach, in the data's units, one for all or one for each
+        movement; ``duration`` stretches time; ``onto`` are the movements to switch to from frame
+        ``start`` over ``steps`` frames, (89).
+        """
+        generate = self._capability("generate")
+        if duration <= 0:
+            raise ValueError(f"duration must be positive; got {duration}")
+        target = None if goal is None else self._scaled_goal(goal, len(like))
+        other = None if onto is None else whole(self._scaled(onto))
+
+        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+            return generate(
+                batch,
+                posterior,
+                goal=target,
+                duration=duration,
+                onto=other,
+                start=start,
+                steps=steps,
+                draws=draws,
+            )
+
+        return self._predict("generate", like, answer, seed)
+
+    def calibrate(
+        self,
+        data: Pairs | Sequences,
+        *,
+        method: Method = "conformal",
+        tasks: Sequence[str] | None = None,
+        setup: Setup | None = None,
+    ) -> Run:
+        """Fit and keep a correction of every spread on movements that training never saw."""
+        self._check_unseen(data, "calibration")
+        for trial in trials(self, data, tasks, setup):
+            if trial.prediction.has_spread:
+                self.recalibrations[trial.task] = recalibrate(
+                    method, trial.prediction.raw, trial.truth, trial.mask, trial.groups
+                )
+        return self
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the run as a folder of safetensors and JSON."""
+        from zoo.storage import save_run
+
+        return save_run(self, Path(folder))
+
+    def posterior(self) -> Posterior | None:
+        """The guide, behind the protocol that models use."""
+        guide = self.assembly.guide
+        return None if guide is None else GuidePosterior(guide)
+
+    def check(self, data: Pairs | Sequences) -> None:
+        """Raise unless the model was made for data of this layout."""
+        self.assembly.layout.check(data.layout)
+
+    def _capability(self, task: str) -> Callable[..., Predictive]:
+        if task not in self.capabilities:
+            raise NotCapableError(
+                f"{self.name} cannot {task}; it can {', '.join(self.capabilities)}"
+            )
+        method: Callable[..., Predictive] = getattr(self.model, task)
+        return method
+
+    def _simple(self, task: Any, data: Sequences, draws: int, seed: int) -> Prediction:
+        method = self._capability(task)
+
+        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+            return method(batch, posterior, draws=draws)
+
+        return self._predict(task, data, answer, seed)
+
+    def _predict(self, task: Any, data: Sequences, answer: Answer, seed: int) -> Prediction:
+        predictive = self._unscaled(self._answer(data, answer, seed), task)
+        layout = self.assembly.layout
+        return Prediction(
+            predictive=predictive,
+            axes=("sequence", "time", "channel"),
+            names=layout.channels,
+            units=layout.units,
+            task=task,
+            rate=layout.rate,
+            lengths=data.lengths,
+            recalibration=self.recalibrations.get(_question(task, data)),
+        )
+
+    def _answer(self, data: Sequences, answer: Answer, seed: int) -> Predictive:
+        scaled = self._scaled(data)
+        if not isinstance(scaled, Sequences):
+            raise TypeError(f"{self.name} predicts Sequences; got {type(data).__name__}")
+        self.model.eval()
+        parts = []
+        with seeded(seed, self.assembly.device), torch.no_grad():
+            for length in sorted(set(scaled.lengths.tolist())):
+                rows = [i for i, n in enumerate(scaled.lengths.tolist()) if n == length]
+                parts.append((rows, answer(whole(scaled[rows]), self.posterior())))
+        return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled))
+
+    def _scaled(self, data: Any) -> Any:
+        self.check(data)
+        return self.scaler.apply(data).to(dtype=self.assembly.dtype, device=self.assembly.device)
+
+    def _unscaled(self, predictive: Predictive, task: str) -> Predictive:
+        if not bool(predictive.location.isfinite().all()):
+            raise FloatingPointError(f"{self.name}: {task} gave values that are not finite")
+        like = predictive.location
+        return predictive.affine(
+            self.scaler.channel_scale.to(like), self.scaler.channel_shift.to(like)
+        )
+
+    def _scaled_goal(self, goal: ArrayLike, count: int) -> Tensor:
+        width = len(self.assembly.layout.channels)
+        array = np.asarray(goal, dtype=np.float64)
+        if array.shape not in ((width,), (count, width)):
+            raise ValueError(
+                f"goal has shape {array.shape}; ({width},) or ({count}, {width}) is needed, "
+                f"in {self.assembly.layout.units[0] or 'data units'}"
+            )
+        rows = torch.from_numpy(np.broadcast_to(array, (count, width)).copy())
+        scaled = (rows - self.scaler.channel_shift) / self.scaler.channel_scale
+        return scaled.to(dtype=self.assembly.dtype, device=self.assembly.device)
+
+    def _as_pairs(self, data: Pairs | ArrayLike) -> Pairs:
+        if isinstance(data, Pairs):
+            return data
+        layout = self.assembly.layout
+        inputs = np.asarray(data, dtype=np.float64)
+        if inputs.ndim != 2 or inputs.shape[1] != len(layout.inputs):
+            raise ValueError(
+                f"inputs have shape {inputs.shape}; (item, {len(layout.inputs)}) is needed"
+            )
+        return Pairs.from_arrays(
+            inputs,
+            np.full((len(inputs), len(layout.channels)), np.nan),
+            features=layout.inputs,
+            feature_units=layout.input_units,
+            channels=layout.channels,
+            units=layout.units,
+        )
+
+    def _check_unseen(self, data: Pairs | Sequences, purpose: str) -> None:
+        known = {tuple(row) for row in self.trained_on["rows"]}
+        if sorted(data.groups) != self.trained_on["columns"]:
+            return
+        again = [row for row in _rows(data) if tuple(row) in known]
+        if again:
+            warnings.warn(
+                f"{len(again)} of {len(data)} items given for {purpose} were trained on "
+                f"(first: {', '.join(again[0])}); spreads on them look better than they are",
+                stacklevel=3,
+            )
+
+
+def fit(
+    assembly: Assembly,
+    train: Pairs | Sequences,
+    *,
+    val: Pairs | Sequences | None = None,
+    run_dir: str | Path | None = None,
+    resume: Resume = "never",
+    progress: bool = False,
+    tensorboard: bool = False,
+) -> Run:
+    """Train what :func:`zoo.create` bound together; the assembly itself stays untouched.
+
+    With ``run_dir`` the training writes checkpoints and, at its end, the run; ``resume="auto"``
+    continues from a checkpoint found there and gives the same bits as an uninterrupted run.
+
+    >>> import numpy as np, zoo
+    >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
+    >>> run = zoo.fit(zoo.create("pca", data, latent_dim=2), data)
+    >>> run.reconstruct(data).shape
+    (4, 20, 3)
+    """
+    assembly.layout.check(train.layout)
+    began = time.monotonic()
+    scaler = Scaler.fit(train, assembly.scaling)
+    model, guide = copy.deepcopy((assembly.model, assembly.guide))
+    trained = replace(assembly, model=model, guide=guide)
+    folder = None if run_dir is None else Path(run_dir)
+
+    def prepared(data: Any) -> Any:
+        return scaler.apply(data).to(dtype=assembly.dtype, device=assembly.device)
+
+    session = Session(
+        seed=assembly.seed,
+        device=assembly.device,
+        folder=folder,
+        resume=resume,
+        progress=progress,
+        tensorboard=tensorboard,
+    )
+    held_out = None if val is None else prepared(val)
+    history = train_model(model, guide, assembly.inference, prepared(train), held_out, session)
+    run = Run(
+        assembly=trained,
+        scaler=scaler,
+        history=history,
+        seconds=time.monotonic() - began,
+        trained_on={"name": train.name, "columns": sorted(train.groups), "rows": _rows(train)},
+    )
+    if folder is not None:
+        run.save(folder)
+    return run
+
+
+def evaluate(
+    run: Run,
+    data: Pairs | Sequences,
+    *,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> Table:
+    """Score every task that the model can do, or those named, on data it never saw."""
+    run._check_unseen(data, "evaluation")
+    rows: list[tuple[str, Trial]] = [(t.task, t) for t in trials(run, data, tasks, setup)]
+    scores = [(task, score(t.prediction, t.truth, t.mask, t.groups)) for task, t in rows]
+    return Table.of(run.name, data.name, scores)
+
+
+def load(folder: str | Path) -> Run:
+    """A run that :meth:`Run.save` wrote; a damaged or foreign folder is refused with its reason."""
+    from zoo.storage import load_run
+
+    return load_run(Path(folder))
+
+
+def _question(task: str, data: Sequences) -> str:
+    """Name under which a task's recalibration is kept: imputation of joints or of a section."""
+    if task != "impute":
+        return task
+    inside = torch.arange(data.values.shape[1]) < data.lengths[:, None]
+    section = bool((inside & ~data.mask.any(-1)).any())
+    return "impute section" if section else "impute joints"
+
+
+def _rows(data: Pairs | Sequences) -> list[list[str]]:
+    columns = [data.groups[key] for key in sorted(data.groups)]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _merge(parts: Sequence[tuple[Sequence[int], Predictive]], count: int) -> Predictive:
+    """Predictives of movements of several lengths as one, padded with zeros in time."""
+
+    def join(tensors: list[Tensor | None], expand: bool) -> Tensor | None:
+        if any(t is None for t in tensors):
+            return None
+        full = [
+            t.expand_as(p.location) if expand else t
+            for t, (_, p) in zip(tensors, parts, strict=True)
+            if t is not None
+        ]
+        longest = max(t.shape[2] for t in full)
+        out = full[0].new_zeros(full[0].shape[0], count, longest, full[0].shape[3])
+        for (rows, _), t in zip(parts, full, strict=True):
+            out[:, list(rows), : t.shape[2]] = t
+        return out
+
+    location = join([p.location for _, p in parts], False)
+    if location is None:
+        raise ValueError("nothing to merge")
+    return Predictive(
+        location=location,
+        noise=join([p.noise for _, p in parts], True),
+        epistemic=join([p.epistemic for _, p in parts], True),
+        joint=all(p.joint for _, p in parts),
+        draws=join([p.draws for _, p in parts], False),
+    )

@@ -1,0 +1,214 @@
+"""What the command line and the demo do with a run: plan, train, reopen, forecast and draw."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table as RichTable
+
+from zoo import archive
+from zoo.assembly import create
+from zoo.catalogue import CATALOGUE
+from zoo.datasets.library import load_data
+from zoo.datasets.records import Pairs, Sequences
+from zoo.errors import DamagedRunError, NotCapableError
+from zoo.prediction import Prediction
+from zoo.run import Run, fit, load
+from zoo.tasks import Setup, trials
+
+__all__ = ["ForecastReport", "Plan", "forecast_report", "open_run", "reliability_figure", "train"]
+
+_PLAN = "plan.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What ``zoo fit`` was asked for; kept beside the run so that its test part can be found."""
+
+    model: str
+    data: str
+    settings: dict[str, str]
+    by: str | None
+    parts: tuple[float, ...]
+    seed: int
+    calibrate: str
+    device: str
+
+    @classmethod
+    def parse(
+        cls,
+        model: str,
+        data: str | None,
+        settings: Sequence[str],
+        by: str | None,
+        parts: str,
+        seed: int,
+        calibrate: str,
+        device: str,
+    ) -> Plan:
+        """A plan from the words of a command line; each is checked and named when wrong."""
+        methods = ("conformal", "isotonic", "scale", "none")
+        if calibrate not in methods:
+            raise ValueError(f"--calibrate is one of {', '.join(methods)}; got {calibrate!r}")
+        return cls(
+            model=model,
+            data=data or CATALOGUE[model].dataset,
+            settings=dict(_setting(word) for word in settings),
+            by=by,
+            parts=_shares(parts),
+            seed=seed,
+            calibrate=calibrate,
+            device=device,
+        )
+
+    def load(self) -> tuple[Any, Any, Any, Any]:
+        """The data, split into train, val, calib and test."""
+        data = load_data(self.data)
+        by = self.by or next(iter(data.groups))
+        train, val, calib, test = data.split(by=by, parts=self.parts, seed=self.seed)
+        return train, val, calib, test
+
+
+def train(plan: Plan, folder: Path, *, resume: bool = False, progress: bool = False) -> Run:
+    """Fit, calibrate and save as planned."""
+    train, val, calib, _ = plan.load()
+    assembly = create(plan.model, train, seed=plan.seed, device=plan.device, **plan.settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    archive.replace_file(folder / _PLAN, json.dumps(asdict(plan), indent=1).encode())
+    run = fit(
+        assembly,
+        train,
+        val=val,
+        run_dir=folder,
+        resume="auto" if resume else "never",
+        progress=progress,
+    )
+    if plan.calibrate != "none":
+        run.calibrate(calib, method=plan.calibrate)  # type: ignore[arg-type]
+        run.save(folder)
+    return run
+
+
+def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:
+    """A run and the data to try it on: another data set, or the test part of its own."""
+    run = load(folder)
+    if data is not None:
+        return run, load_data(data)
+    path = folder / _PLAN
+    if not path.is_file():
+        raise DamagedRunError(f"{folder} holds no {_PLAN}: name a data set with --data")
+    saved = json.loads(path.read_text(encoding="utf-8"))
+    plan = Plan(**{**saved, "parts": tuple(saved["parts"])})
+    return run, plan.load()[3]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForecastReport:
+    """A forecast with its 90 % bands, movement by movement."""
+
+    prediction: Prediction
+    seen: int
+    groups: dict[str, tuple[str, ...]]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row for every movement, frame and channel."""
+        p = self.prediction
+        low, high = p.interval(0.9)
+        return [
+            {
+                **{k: v[s] for k, v in self.groups.items()},
+                "frame": self.seen + t,
+                "channel": name,
+                "unit": p.units[c],
+                "mean": float(p.mean[s, t, c]),
+                "low_90": float(low[s, t, c]),
+                "high_90": float(high[s, t, c]),
+            }
+            for s in range(p.shape[0])
+            for t in range(p.shape[1])
+            for c, name in enumerate(p.names)
+        ]
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The rows as plain data."""
+        return self.rows()
+
+    def __rich__(self) -> RichTable:
+        """The last forecast frame of every movement's first channels."""
+        table = RichTable("movement", "frame", "channel", "mean", "90 % band", box=None)
+        wanted = set(self.prediction.names[:4])
+        last = self.seen + self.prediction.shape[1] - 1
+        keys = list(self.groups)
+        for row in self.rows():
+            if row["frame"] == last and row["channel"] in wanted:
+                who = " ".join(f"{k} {row[k]}" for k in keys)
+                band = f"{row['low_90']:.3f} … {row['high_90']:.3f} {row['unit']}"
+                table.add_row(who, str(last), row["channel"], f"{row['mean']:.3f}", band)
+        return table
+
+
+def forecast_report(
+    run: Run,
+    data: Sequences,
+    *,
+    seen: int | None,
+    horizon: int | None,
+    output: Path | None = None,
+    figure: Path | None = None,
+) -> ForecastReport:
+    """Forecast all movements after their first frames; write and draw what was asked for."""
+    if "forecast" not in run.capabilities:
+        raise NotCapableError(f"{run.name} cannot forecast; it can {', '.join(run.capabilities)}")
+    setup = Setup(seen=seen, horizon=horizon)
+    first, ahead = setup.frames(data)
+    prediction = run.forecast(data.first(first), horizon=ahead)
+    report = ForecastReport(prediction=prediction, seen=first, groups=data.groups)
+    if output is not None:
+        _write_csv(output, report.rows())
+    if figure is not None:
+        forecast_figure(prediction, data, first, figure)
+    return report
+
+
+def forecast_figure(prediction: Prediction, data: Sequences, seen: int, path: Path) -> None:
+    """Draw the bands of the channels that move most, for the first movement."""
+    from zoo.evaluation.figures import forecast_bands
+
+    forecast_bands(prediction, data.values, seen=seen).savefig(path, dpi=150)
+
+
+def reliability_figure(run: Run, data: Pairs | Sequences, path: Path) -> None:
+    """Draw nominal against observed coverage of every task."""
+    from zoo.evaluation.figures import reliability
+
+    answers = [t for t in trials(run, data) if t.prediction.has_spread]
+    reliability({t.task: (t.prediction, t.truth, t.mask) for t in answers}).savefig(path, dpi=150)
+
+
+def _setting(word: str) -> tuple[str, str]:
+    key, equals, value = word.partition("=")
+    if not equals or not key:
+        raise ValueError(f"--set takes KEY=VALUE; got {word!r}")
+    return key.strip().replace("-", "_"), value.strip()
+
+
+def _shares(words: str) -> tuple[float, ...]:
+    try:
+        shares = tuple(float(w) for w in words.split(","))
+    except ValueError:
+        raise ValueError(f"--parts takes four shares like .6,.1,.15,.15; got {words!r}") from None
+    if len(shares) != 4:
+        raise ValueError(f"--parts takes four shares (train,val,calib,test); got {len(shares)}")
+    return shares
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
