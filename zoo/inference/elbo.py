@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import pyro
 import torch
-from pyro import poutine
 from pyro.distributions.util import scale_and_mask
 from pyro.infer.enum import get_importance_trace
 from pyro.poutine.messenger import Messenger
@@ -42,6 +40,16 @@ class Sites:
     model: dict[str, Site]
     guide: dict[str, Site]
 
+    @property
+    def observed(self) -> list[str]:
+        """Names of the model's observed sites."""
+        return [name for name, site in self.model.items() if site["is_observed"]]
+
+    @property
+    def latent(self) -> list[str]:
+        """Names of the model's latent sites."""
+        return [name for name, site in self.model.items() if not site["is_observed"]]
+
 
 @dataclass(frozen=True)
 class Bound:
@@ -49,8 +57,7 @@ class Bound:
 
     ``loss = −[c log p(x|z) − β (log q(z) − c log p(z))]`` is what training minimises, (87);
     ``reconstruction = Σ log p(x|z)`` and ``kl = Σ log q(z) − log p(z)`` are free of c and β.
-    ``terms`` holds the log densities of every site, by name, as ``p(name)`` and ``q(name)``;
-    the closed-form KL of a site is ``kl(name)``.
+    ``terms`` holds the parts by name of the site: ``p(name)``, ``q(name)`` and ``kl(name)``.
     """
 
     loss: Tensor
@@ -71,56 +78,52 @@ class Bound:
 def bound(
     model: Program, guide: Program, batch: Batch, *, c: float = 1.0, beta: float = 1.0
 ) -> Bound:
-    """One reparameterised draw of the bound; the model's log densities are scaled by ``c``."""
-    drawn = sites(model, guide, batch, c=c)
-    terms: dict[str, Tensor] = {}
-    observed: list[Tensor] = []
-    latent: list[Tensor] = []
-    for name, site in drawn.model.items():
-        log_p = terms[f"p({name})"] = log_density(site)
-        (observed if site["is_observed"] else latent).append(log_p)
-    for name, site in drawn.guide.items():
-        terms[f"q({name})"] = log_density(site)
-    log_q = _total([terms[f"q({name})"] for name in drawn.guide])
-    likelihood, prior = _total(observed), _total(latent)
-    reconstruction, divergence = likelihood, log_q - prior
-    loss = beta * divergence - reconstruction
-    if c != 1.0:
-        reconstruction, divergence = likelihood / c, log_q - prior / c
-    return Bound(loss, _detach(reconstruction), _detach(divergence), terms)
+    """One reparameterised draw of the bound, all its terms sampled; c tempers the model alone."""
+    drawn = sites(model, guide, batch)
+    p = {name: log_density(site) for name, site in drawn.model.items()}
+    q = {name: log_density(site) for name, site in drawn.guide.items()}
+    likelihood = _total([p[name] for name in drawn.observed])
+    prior = _total([p[name] for name in drawn.latent])
+    log_q = _total(list(q.values()))
+    loss = beta * (log_q - c * prior) - c * likelihood
+    terms = {f"p({n})": v for n, v in p.items()} | {f"q({n})": v for n, v in q.items()}
+    return Bound(loss, likelihood.detach(), (log_q - prior).detach(), terms)
 
 
-def tight_bound(model: Program, guide: Program, batch: Batch) -> Bound:
-    """The plain bound with every KL in closed form where one is known: less Monte Carlo noise.
+def tight_bound(
+    model: Program, guide: Program, batch: Batch, *, c: float = 1.0, beta: float = 1.0
+) -> Bound:
+    """The same bound with KLs in closed form where they are known: fewer terms, less noise.
 
     A site whose KL is not known, or whose parents in the model may come later in the guide, keeps
-    its sampled log q − log p.
+    its sampled log q − log p. Where c < 1 a closed site costs c KL + (1 − c) log q.
     """
     drawn = sites(model, guide, batch)
-    terms = {f"p({n})": log_density(s) for n, s in drawn.model.items() if s["is_observed"]}
-    reconstruction = _total(list(terms.values()))
+    observed = {f"p({name})": log_density(drawn.model[name]) for name in drawn.observed}
     kls = {f"kl({name})": kl for name, kl in divergences(drawn).items()}
-    kl = _total(list(kls.values()))
-    return Bound(kl - reconstruction, _detach(reconstruction), _detach(kl), terms | kls)
+    likelihood, kl = _total(list(observed.values())), _total(list(kls.values()))
+    cost = kl
+    if c != 1.0:
+        cost = c * kl + (1.0 - c) * _total([log_density(site) for site in drawn.guide.values()])
+    loss = beta * cost - c * likelihood
+    return Bound(loss, likelihood.detach(), kl.detach(), observed | kls)
 
 
 def divergences(drawn: Sites) -> dict[str, Tensor]:
     """KL(q ‖ p) of every latent site, in closed form where that is known and right."""
-    latent = [name for name, site in drawn.model.items() if not site["is_observed"]]
-    same_order = latent == [name for name in drawn.guide if name in drawn.model]
+    same_order = drawn.latent == [name for name in drawn.guide if name in drawn.model]
     shared = {
         name: _divergence(drawn.guide[name], drawn.model[name], closed=same_order)
-        for name in latent
+        for name in drawn.latent
     }
     return shared | {n: log_density(s) for n, s in drawn.guide.items() if n not in drawn.model}
 
 
-def sites(model: Program, guide: Program, batch: Batch, *, c: float = 1.0) -> Sites:
+def sites(model: Program, guide: Program, batch: Batch) -> Sites:
     """Run the guide, then the model on the guide's draws."""
     with _Record() as posterior:
         guide(batch)
-    tempered = nullcontext() if c == 1.0 else poutine.scale(scale=c)
-    with _Record(given=posterior.seen) as joint, tempered:
+    with _Record(given=posterior.seen) as joint:
         model(batch)
     return Sites(joint.real, posterior.real)
 
@@ -179,7 +182,7 @@ def _divergence(q: Site, p: Site, *, closed: bool) -> Tensor:
 
 
 def _check_match(drawn: Sites) -> None:
-    latent = {name for name, site in drawn.model.items() if not site["is_observed"]}
+    latent = set(drawn.latent)
     if missing := sorted(latent - set(drawn.guide)):
         raise ValueError(f"the guide has no site for {', '.join(missing)} of the model")
     drawn_only = {n for n, s in drawn.guide.items() if not s["infer"].get("is_auxiliary")}
@@ -195,7 +198,3 @@ def _check_match(drawn: Sites) -> None:
 
 def _total(terms: list[Tensor]) -> Tensor:
     return sum(terms[1:], terms[0]) if terms else torch.zeros(())
-
-
-def _detach(value: Tensor) -> Tensor:
-    return value.detach()

@@ -142,8 +142,9 @@ class _Windows:
         if len(kept) == len(self.movements):
             return self.movements, self.movement_mask, sequence
         kept = kept.to(self.device)
-        mask = None if self.movement_mask is None else self.movement_mask[kept]
-        return self.movements[kept], mask, inverse
+        mask = self.movement_mask
+        kept_mask = None if mask is None else mask.index_select(0, kept)
+        return self.movements.index_select(0, kept), kept_mask, inverse
 
 
 class _Items:

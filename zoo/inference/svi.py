@@ -18,7 +18,7 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import TrainingError, TrainingWarning
 from zoo.inference import checkpoint
 from zoo.inference.collapse import warn_of_collapse
-from zoo.inference.elbo import Bound, bound, check, tight_bound
+from zoo.inference.elbo import Bound, check, tight_bound
 from zoo.inference.history import History, Log, Row
 from zoo.inference.loader import Loader, stream
 from zoo.inference.progress import TrainingBar
@@ -157,7 +157,7 @@ class _Training:
         self._seed_noise("step", self.state.place.step, self.state.tries)
         for parameter in self.parameters.values():
             parameter.grad = None
-        terms = bound(self.model, self.guide, batch, c=c, beta=beta)
+        terms = tight_bound(self.model, self.guide, batch, c=c, beta=beta)
         (terms.loss / batch.total).backward()
         norm = self._clip()
         parts = (terms.loss.detach(), terms.reconstruction, terms.kl, norm)
@@ -247,7 +247,7 @@ class _Training:
 
     def _blame(self, terms: Bound) -> str:
         if broken := terms.broken():
-            return f"log density {', '.join(broken)}"
+            return f"the bound's term {', '.join(broken)}"
         for name, parameter in self.parameters.items():
             if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
                 return f"the gradient of {name}"
