@@ -66,6 +66,7 @@ class Sequences:
         controls: Sequence[ArrayLike] | None = None,
         control_names: Sequence[str] | None = None,
         control_units: str | Sequence[str] = "",
+        time_normalised: bool = False,
         name: str = "sequences",
         provenance: str = "public",
     ) -> Self:
@@ -97,6 +98,7 @@ class Sequences:
             controls=known,
             control_names=distinct_names(control_names, width, "control"),
             control_units=units_of(control_units, width),
+            time_normalised=time_normalised,
             name=name,
             provenance=provenance,
         )
