@@ -146,6 +146,8 @@ def test_resumed_equals_uninterrupted(tmp_path: Path, after: int, seconds: float
 
 
 def test_resume_refuses_another_training(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"resume must be .* got 'yes'"):
+        fit_svi(*fresh(), lg.frames(), QUICK, folder=tmp_path, resume="yes")
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         fit_svi(*fresh(), lg.frames(), QUICK, folder=tmp_path, resume="must")
     fit_svi(*fresh(), lg.frames(), QUICK, folder=tmp_path)

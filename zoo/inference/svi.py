@@ -31,6 +31,7 @@ __all__ = ["fit_svi"]
 
 TRIES = 6
 SETTLED = 200
+SHARE = 0.05
 
 
 def fit_svi(
@@ -54,8 +55,9 @@ def fit_svi(
     The noise of a step depends on the seed and the step alone, and the order of the data on the
     seed and the epoch: a training that was killed at any moment and resumed from ``folder`` ends
     in the same bits as one that was not. A checkpoint is written every
-    ``strategy.checkpoint_every`` epochs and every ``checkpoint_seconds``. With ``val`` the state
-    of the best un-tempered validation bound is restored; only epochs with c = β = 1 count.
+    ``strategy.checkpoint_every`` epochs, less often where that would cost more than 5 % of the
+    time, and every ``checkpoint_seconds``, inside an epoch too. With ``val`` the state of the best
+    un-tempered validation bound is restored; only epochs with c = β = 1 count.
 
     Raises TrainingError where the loss stays non-finite however small the step, DamagedRunError
     for a checkpoint that is damaged or of another training, and FileNotFoundError where
@@ -104,9 +106,11 @@ class _Training:
 
     def keep_in(self, folder: Path | None, log: Log, seconds: float) -> None:
         self.folder, self.log, self.seconds = folder, log, seconds
-        self.written = time.monotonic()
+        self.written, self.pause = time.monotonic(), 0.0
 
     def begin(self, resume: str) -> None:
+        if resume not in ("never", "auto", "must"):
+            raise ValueError(f"resume must be 'never', 'auto' or 'must'; got {resume!r}")
         found = self.folder is not None and checkpoint.exists(self.folder)
         if resume == "must" and not found:
             raise FileNotFoundError(f"resume='must': there is no checkpoint in {self.folder}")
@@ -149,8 +153,7 @@ class _Training:
                 state.good, state.good_place, start = start, place, None
             state.place = state.place.after(figures)
             bar.step(place.epoch, state.place.batch)
-            if time.monotonic() - self.written > self.seconds:
-                self._save()
+            self._save_after(self.seconds)
 
     def _step(self, batch: Batch, c: float, beta: float) -> tuple[float, ...]:
         """One step of the optimiser; loss, reconstruction, KL and gradient norm of the batch."""
@@ -228,7 +231,7 @@ class _Training:
         if bored or place.epoch == strategy.epochs:
             self._finish()
         elif place.epoch % strategy.checkpoint_every == 0:
-            self._save()
+            self._save_after(self.pause)
 
     def _finish(self) -> None:
         if self.state.best is not None:
@@ -240,10 +243,17 @@ class _Training:
             rows = self.loader.order(0)[: self.strategy.batch_size]
             warn_of_collapse(self.model, self.guide, self.loader.take(rows))
 
+    def _save_after(self, seconds: float) -> None:
+        if time.monotonic() - self.written >= seconds:
+            self._save()
+
     def _save(self) -> None:
-        if self.folder is not None:
-            self.state.save(self.folder, self.parts, self.made_of)
+        if self.folder is None:
+            return
+        begin = time.monotonic()
+        self.state.save(self.folder, self.parts, self.made_of)
         self.written = time.monotonic()
+        self.pause = (self.written - begin) / SHARE
 
     def _blame(self, terms: Bound) -> str:
         if broken := terms.broken():
