@@ -1,4 +1,4 @@
-"""One training step of VAE-DMP against the same bound written by hand, a site a step, and in NumPyro.
+"""A training step of VAE-DMP against the bound by hand, with a site a step, and in NumPyro.
 
 ``python -m benchmarks.vae_dmp`` writes ``results/benchmark_vae_dmp.json``.
 """
@@ -93,7 +93,6 @@ def per_step(model: VaeDmp, guide: FilteringGuide) -> tuple[Callable[[Batch], No
     def unit(*shape: int) -> Any:
         return dist.Normal(torch.zeros(shape), 1.0).to_event(len(shape) - 1)
 
-
     def generative(batch: Batch) -> None:
         rows = len(batch)
         with pyro.plate("windows", batch.total, subsample=torch.arange(rows)):
@@ -147,7 +146,8 @@ def numpyro_step(model: VaeDmp, batch: Batch, hidden: int) -> Callable[[], objec
     import jax.numpy as jnp
     import numpyro
     from numpyro import distributions as nd
-    from numpyro.infer import SVI, Trace_ELBO as NumpyroElbo
+    from numpyro.infer import SVI
+    from numpyro.infer import Trace_ELBO as NumpyroElbo
 
     system, latent, settings = model.system, model.latent_dim, model.config
     x = jnp.asarray(batch.values.numpy())

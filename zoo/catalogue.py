@@ -7,6 +7,10 @@ from zoo.strategies import Exact, MarginalLikelihood, Svi
 
 __all__ = ["CATALOGUE", "list_models"]
 
+_VAE_DMP = Svi(
+    window=10, epochs=1500, batch_size=64, learning_rate=5e-3, clip=100.0, temper_epochs=100
+)
+
 CATALOGUE = Registry(
     [
         Entry(
@@ -38,6 +42,29 @@ CATALOGUE = Registry(
             inference=Svi(window=2, epochs=200),
             data="sequences",
             dataset="pendulum/images",
+        ),
+        Entry(
+            name="vae-dmp",
+            summary="Dynamic movement primitives in the latent space of a time-dependent VAE",
+            thesis="§6.2",
+            model="zoo.models.vae_dmp:VaeDmp",
+            guide="zoo.guides.filtering:FilteringGuide",
+            inference=_VAE_DMP,
+            data="sequences",
+            dataset="thesis-movements",
+            scaling="center",
+        ),
+        Entry(
+            name="vae-dmp-single",
+            summary="VAE-DMP with 120 hidden units, for one movement a model",
+            thesis="§6.3.1.1",
+            model="zoo.models.vae_dmp:VaeDmp",
+            guide="zoo.guides.filtering:FilteringGuide",
+            inference=_VAE_DMP,
+            data="sequences",
+            dataset="thesis-movements",
+            scaling="center",
+            config={"hidden": 120},
         ),
         Entry(
             name="gp",

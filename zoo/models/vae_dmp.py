@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
 
 import pyro
 import pyro.distributions as dist
@@ -11,79 +10,54 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from zoo.dynamics.dmp import (
-    Response,
-    Transformation,
-    discrete_basis,
-    input_vector,
-    transition_matrix,
-)
-from zoo.nn.mlp import mlp
-from zoo.types import Batch, Layout
+from zoo.dynamics.dmp import Response
+from zoo.dynamics.paths import Conditioned, PathPrior
+from zoo.errors import NotFittedError
+from zoo.inference.chain import conditional_draws
+from zoo.models.latent_dmp import Config, LatentDmp
+from zoo.prediction import Predictive
+from zoo.types import Batch, Layout, Posterior
 
 __all__ = ["Config", "VaeDmp"]
 
+_LEARNED = ("prior_movements", "prior_process", "prior_observation", "prior_shape")
+PRIOR_DRAWS = 32
+CHAINS, BURN_IN, KEPT = 8, 24, 64
+UNSEEN = 1e6
+GOAL_SLACK = 1e-2
 
-@dataclass(frozen=True, kw_only=True)
-class Config:
-    """``latent_dim`` d', ``hidden`` decoder units, ``kernels`` of the forcing term, α (β = α/4).
 
-    ``w_scale`` and ``velocity_scale`` are the prior standard deviations of w and ż_1, in units of
-    the acceleration αβ and of the movement's length; ``noise_scale`` is where w_ε starts, in the
-    same unit as w; ``output_std`` where the constant output spread starts, in scaled units.
+class VaeDmp(LatentDmp):
+    r"""Movements as latent DMPs with process noise, decoded frame by frame (thesis §6.2).
+
+    With s = (z*, ż), β = α/4 and dt = 1/(n − 1)::
+
+        w ~ N(0, I),  z^goal, z_t ~ N(0, I),  ż_1 = σ_ż v,  v ~ N(0, I),  z* = g(z)
+        s_{t+1} = A s_t + [dt, 1]ᵀ (αβ z*^goal + f_t + ε_{t+1}) dt,       (74)–(77)
+        f_t = αβ σ_w Ψ(s_t) w,  ε = αβ ε̂ w_ε,  ε̂ ~ N(0, I)
+        x_t ~ N(μ(z*_t), diag σ²),  σ constant in time                    (82), (83)
+
+    Every window is observed twice, with z*_t rolled out (81) and with z*_t = g(z_t) of its own
+    (80). Choices where the thesis is silent: g(z) = z + MLP(z); ż_1 has a Gaussian prior of its own
+    and is recognised from the first two frames; σ = s² + floor.
+
+    Forecasts and imputation know neither w nor goal of a new movement: after training the latents
+    of the training movements become a mixture over latent paths, which is conditioned exactly on
+    the frames seen (:class:`~zoo.dynamics.paths.PathPrior`). Movements must have one common length.
+    N. Chen, M. Karl, P. van der Smagt, *Dynamic movement primitives in latent space of
+    time-dependent variational autoencoders*, Humanoids 2016.
     """
 
-    latent_dim: int = 5
-    hidden: int = 200
-    kernels: int = 50
-    alpha: float = 25.0
-    transition_hidden: int = 32
-    w_scale: float = 3.0
-    velocity_scale: float = 10.0
-    noise_scale: float = 0.3
-    output_std: float = 0.3
-    output_floor: float = 1e-3
-
-    def __post_init__(self) -> None:
-        """Refuse empty layers and scales."""
-        for name in ("latent_dim", "hidden", "transition_hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        if self.kernels < 2:
-            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
-        for name in ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
-
-
-class VaeDmp(nn.Module):
-    """VAE-DMP (stub docstring)."""
-
-    config_class: ClassVar[type] = Config
-    dtype: ClassVar[torch.dtype] = torch.float32
-
-    basis: Tensor
-    step_matrix: Tensor
-    step_input: Tensor
+    prior_movements: Tensor
+    prior_process: Tensor
+    prior_observation: Tensor
+    prior_shape: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model of movements of ``layout.frames`` frames, all of one length."""
-        super().__init__()
-        self.config, self.frames = config, _frames(layout)
-        self.latent_dim, self.kernels = config.latent_dim, config.kernels
-        channels, latent = len(layout.channels), config.latent_dim
-        self.system = Transformation(config.alpha, config.alpha / 4, 1.0, 1 / (self.frames - 1))
-        self.decoder = mlp([latent, config.hidden, channels])
-        self.g = mlp([latent, config.transition_hidden, latent], "tanh")
-        nn.init.zeros_(self.g[-1].weight)
-        self.w_noise = nn.Parameter(config.noise_scale * torch.eye(latent))
-        self.output_root = nn.Parameter(torch.full((channels,), config.output_std**0.5))
-        time = torch.arange(self.frames - 1, dtype=torch.float64)
-        basis = discrete_basis(time, kernels=config.kernels, duration=self.frames - 1)
-        self.register_buffer("basis", basis.float())
-        eye = torch.eye(latent, dtype=torch.float64)
-        self.register_buffer("step_matrix", torch.kron(transition_matrix(self.system).T.contiguous(), eye).float())
-        self.register_buffer("step_input", torch.kron(input_vector(self.system)[None], eye).float())
+        super().__init__(layout, config)
+        for name in _LEARNED:
+            self.register_buffer(name, torch.empty(0))
 
     def forward(self, batch: Batch) -> None:
         """The Pyro program: both sub-sequence lengths, (80) and (81), observe the window (82)."""
@@ -106,78 +80,202 @@ class VaeDmp(nn.Module):
                     x = x.mask(batch.mask)
                 pyro.sample(name, x.to_event(2), obs=batch.values)
 
-    @property
-    def output_std(self) -> Float[Tensor, " channel"]:
-        """The constant spread of every channel, (83)."""
-        return self.output_root.square() + self.config.output_floor
+    def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Paths z* with the recognised noise."""
+        return Predictive(location=self._posterior_paths(batch, posterior, draws), joint=True)
 
-    @property
-    def transition(self) -> Float[Tensor, "state state"]:
-        """A of (76) for row vectors (z*, ż)."""
-        return self.step_matrix
+    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Whole movements through the DMP with the recognised w, goal, start and noise."""
+        return self._decoded(self._posterior_paths(batch, posterior, draws))
 
-    def embed(self, z: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch latent"]:
-        """z* = g(z)."""
-        moved: Tensor = z + self.g(z)
-        return moved
+    def forecast(
+        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
+    ) -> Predictive:
+        """Joint draws of the future, given the encoded frames seen; phase 0 is the first frame."""
+        seen = batch.values.shape[1]
+        paths = self._conditioned(batch, _need(posterior), seen + horizon).sample(draws)
+        return self._decoded(paths[:, :, seen:])
 
-    def noise_gain(self) -> Float[Tensor, "latent state"]:
-        """G: ε = ε̂ w_ε enters the next state as (77) says."""
-        return (self.system.stiffness * self.w_noise) @ self.step_input
+    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Joint draws of whole movements given the entries seen."""
+        paths = self._conditioned(batch, _need(posterior), batch.values.shape[1]).sample(draws)
+        return self._decoded(paths)
 
-    def initial_state(
-        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
-    ) -> Float[Tensor, "window state"]:
-        """(z*_1, ż_1) of a window's first frame."""
-        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
-
-    def forces(
+    def generate(
         self,
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
         batch: Batch,
-    ) -> Float[Tensor, "step window latent"]:
-        """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
-        steps = batch.values.shape[1] - 1
-        pull = self.embed(goal) + torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
-        at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
-        row = at * pull.shape[1] + batch.sequence
-        picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
-        return picked.view(steps, len(batch), -1)
+        posterior: Posterior | None,
+        *,
+        goal: Float[Tensor, "sequence channel"] | None,
+        duration: float,
+        onto: Batch | None,
+        start: int,
+        steps: int,
+        draws: int,
+    ) -> Predictive:
+        """Goal changes (§6.2.5), other durations and switching (89), with noise from its prior."""
+        guide = _need(posterior)
+        here = self._latents(guide.draw(batch, draws))
+        if goal is not None:
+            here = self._aimed(here, self.embed(guide.encode(goal).sample((draws,))))
+        pull, position, velocity = self._pull(here, duration), here.position, here.velocity
+        if onto is not None:
+            there = self._pull(self._latents(guide.draw(onto, draws)), duration)
+            pull = torch.lerp(pull, there, _ramp(pull.shape[-2], start, steps))
+        noise = torch.randn_like(pull) @ self.w_noise
+        system = replace(self.system, tau=duration)
+        response = Response.of(system, pull.shape[-2] + 1, pull.dtype, pull.device)
+        rest = torch.zeros_like(position)
+        force = system.stiffness * (pull + noise)
+        return self._decoded(response.states(position, velocity / duration, rest, force)[0])
 
-    def drive(
-        self,
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
-        batch: Batch,
-    ) -> Float[Tensor, "step window state"]:
-        """What goal and forcing term add to the state in every step, (77)."""
-        return self.forces(w, goal, batch) @ self.step_input
+    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
+        """Keep the latents of the training movements, the noise found and how well paths fit."""
+        drawn = posterior.draw(batch, PRIOR_DRAWS)
+        found = self._latents(drawn)
+        parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
+        self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
+        noise = self.system.stiffness * (drawn["epsilon"] @ self.w_noise).flatten(0, 2)
+        self.prior_process = (noise.T @ noise / len(noise)).detach()
+        path = self._paths(drawn, batch, PRIOR_DRAWS)
+        frames = self.embed(posterior.encode(batch.values, batch.mask).mean)
+        apart = (path - frames)[:, _frames_seen(batch)].flatten(0, 1)
+        self.prior_observation = (apart.T @ apart / len(apart)).detach()
+        self.prior_shape = path.new_tensor([PathPrior.bandwidth, PathPrior.shrinkage])
+        tuned = self._prior(self.frames).tuned((self.frames // 7, self.frames // 2))
+        self.prior_shape = path.new_tensor([tuned.bandwidth, tuned.shrinkage])
 
-    def path(
-        self,
-        z: Float[Tensor, "window latent"],
-        velocity: Float[Tensor, "window latent"],
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
-        ε: Float[Tensor, "window step latent"],
-        batch: Batch,
-    ) -> Float[Tensor, "window time latent"]:
-        """z*_{1:T} by the linear response of (75): no loop over time."""
-        steps = batch.values.shape[1]
-        response = Response.of(self.system, steps, z.dtype, z.device)
-        noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
-        force = self.forces(w, goal, batch) + noise
-        start = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
-        states = response.product(start.flatten(1), force.flatten(1))
-        return states[0].view(steps, len(batch), -1).transpose(0, 1)
-
-
-def _frames(layout: Layout) -> int:
-    if layout.frames is None or layout.frames < 3:
-        raise ValueError(
-            "vae-dmp needs movements of one common length of at least 3 frames; got "
-            f"{'several lengths' if layout.frames is None else layout.frames}: "
-            "bring them to one by data.resampled(70) or data.windows(70)"
+    def _latents(self, drawn: dict[str, Tensor]) -> _Latents:
+        return _Latents(
+            w=drawn["w"],
+            goal=self.embed(drawn["goal"]),
+            position=self.embed(drawn["z"][:, :, 0]),
+            velocity=self.config.velocity_scale * drawn["velocity"],
         )
-    return layout.frames
+
+    def _pull(self, found: _Latents, duration: float) -> Float[Tensor, "sample sequence step d"]:
+        """z^goal + σ_w Ψ w at every step: the forces in units of αβ."""
+        steps = round((self.frames - 1) * duration)
+        basis = self.config.w_scale * self.kernels_at(steps, duration).to(found.w)
+        return found.goal.unsqueeze(2) + basis @ found.w
+
+    def _aimed(self, found: _Latents, goal: Float[Tensor, "sample sequence d"]) -> _Latents:
+        """Another goal, the forcing term multiplied by (g − y_0)/(g_fit − y_0), §6.2.5."""
+        old, new = found.goal - found.position, goal - found.position
+        ratio = (new * old + GOAL_SLACK) / (old.square() + GOAL_SLACK)
+        return replace(found, w=found.w * ratio.unsqueeze(2), goal=goal)
+
+    def _paths(self, drawn: dict[str, Tensor], batch: Batch, draws: int) -> Tensor:
+        flat = {name: value.flatten(0, 1) for name, value in drawn.items()}
+        first = flat["z"][:, 0]
+        path = self.path(
+            first, flat["velocity"], flat["w"], flat["goal"], flat["epsilon"], batch.repeat(draws)
+        )
+        return path.unflatten(0, (draws, len(batch)))
+
+    def _posterior_paths(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
+        if batch.values.shape[1] != self.frames:
+            raise ValueError(
+                f"movements have {batch.values.shape[1]} frames; this model was made for "
+                f"{self.frames}: a part of a movement can be forecast or imputed"
+            )
+        return self._paths(_need(posterior).draw(batch, draws), batch, draws)
+
+    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        location = self.decoder(paths.to(self.output_root))
+        return Predictive(location=location, noise=self.output_std, joint=True)
+
+    def _prior(self, length: int) -> PathPrior:
+        """The mixture over latent paths of ``length`` frames, in float64."""
+        if not self.prior_movements.numel():
+            raise NotFittedError("vae-dmp knows no movements yet; train it by zoo.fit first")
+        u, process = self.prior_movements.double(), self.prior_process.double()
+        response = Response.of(self.system, length, torch.float64, u.device)
+        force = self.system.stiffness * torch.cat(
+            [self.config.w_scale * self.kernels_at(length - 1), torch.ones(length - 1, 1)], dim=1
+        )
+        start = torch.zeros(2, self.kernels + 3, dtype=torch.float64)
+        start[0, -2] = start[1, -1] = 1.0
+        φ = response.product(start, nn.functional.pad(force, (0, 2)))[0]
+        still = torch.zeros(2, length - 1, dtype=torch.float64)
+        kicks = response.product(still, torch.eye(length - 1, dtype=torch.float64))[0]
+        shape = self.prior_shape.tolist()
+        return PathPrior(
+            paths=φ @ u,
+            spread=torch.einsum("tk,kd,sk->dts", φ, _variances(u), φ),
+            process=torch.einsum("ts,ij->tisj", kicks @ kicks.T, process),
+            observation=self.prior_observation.double(),
+            bandwidth=shape[0],
+            shrinkage=shape[1],
+        )
+
+    def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
+        """p(z*_{1:length} | frames seen)."""
+        seen, prior = batch.values.shape[1], self._prior(length)
+        where = torch.arange(length) < seen
+        y = self.embed(posterior.encode(batch.values).mean)
+        extra = None
+        if batch.mask is not None:
+            y, extra = self._encoded(batch.values, batch.mask, y, posterior)
+            extra = nn.functional.pad(extra.double(), (0, 0, 0, 0, 0, length - seen))
+        return prior.condition(
+            nn.functional.pad(y.double(), (0, 0, 0, length - seen)), where, extra
+        )
+
+    def _encoded(
+        self, values: Tensor, mask: Tensor, y: Tensor, posterior: Posterior
+    ) -> tuple[Float[Tensor, "sequence time d"], Float[Tensor, "sequence time d d"]]:
+        """Latent frames and how uncertain missing entries make them (Rezende et al. 2014)."""
+        extra = torch.diag_embed(UNSEEN * (~mask.any(-1, keepdim=True)).to(y).expand_as(y))
+        part = mask.any(-1) & ~mask.all(-1)
+        if not part.any():
+            return y, extra
+        z = conditional_draws(
+            lambda z: (self.decoder(self.embed(z)), self.output_std),
+            posterior.encode,
+            values[part],
+            mask[part],
+            self.latent_dim,
+            draws=KEPT,
+            chains=CHAINS,
+            burn_in=BURN_IN,
+        )
+        moved = self.embed(z)
+        apart = moved - moved.mean(0)
+        extra[part] = torch.einsum("sid,sie->ide", apart, apart) / (KEPT - 1)
+        return y.masked_scatter(part[..., None], moved.mean(0)), extra
+
+
+@dataclass(frozen=True)
+class _Latents:
+    """What belongs to movements: w and, in the space of z*, goal, first frame and velocity."""
+
+    w: Float[Tensor, "sample sequence kernel latent"]
+    goal: Float[Tensor, "sample sequence latent"]
+    position: Float[Tensor, "sample sequence latent"]
+    velocity: Float[Tensor, "sample sequence latent"]
+
+
+def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row latent"]:
+    """Variance of every row between movements, one for all kernels; of one movement its size."""
+    apart = u - u.mean(0) if len(u) > 1 else u
+    kernels = apart[:, :-3].square().mean((0, 1)).expand(u.shape[1] - 3, -1)
+    return torch.cat([kernels, apart[:, -3:].square().mean(0)])
+
+
+def _frames_seen(batch: Batch) -> Tensor:
+    if batch.mask is None:
+        return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=batch.values.device)
+    return batch.mask.all(-1)
+
+
+def _ramp(length: int, start: int, steps: int) -> Float[Tensor, "step 1"]:
+    """η of the movement switched to: 0 before ``start``, 1 from ``start + steps`` on, (89)."""
+    time = torch.arange(length, dtype=torch.float32)[:, None]
+    return ((time - start) / max(steps, 1)).clamp(0, 1)
+
+
+def _need(posterior: Posterior | None) -> Posterior:
+    if posterior is None:
+        raise TypeError("vae-dmp predicts through its guide; got no posterior")
+    return posterior

@@ -1,0 +1,231 @@
+"""The process noise of a filter as one vectorised distribution with its own adjoint."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from pyro.distributions import TorchDistribution, constraints
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.distributions import kl
+
+__all__ = ["FilteringNoise", "NoiseNetwork"]
+
+ROOT_SCALE = 0.1
+
+
+class NoiseNetwork(nn.Module):
+    """Moments of ε̂_{t+1} from (x_{t+1}, z_t), (79): one hidden layer, σ = (W_σ h + b_σ)² + floor.
+
+    >>> network = NoiseNetwork(channels=50, latent_dim=5, hidden=20)
+    >>> mean, std = network(network.features(torch.randn(4, 50)), torch.randn(4, 5))
+    >>> mean.shape, std.shape
+    (torch.Size([4, 5]), torch.Size([4, 5]))
+    """
+
+    def __init__(
+        self, *, channels: int, latent_dim: int, hidden: int, initial: float = 1.0
+    ) -> None:
+        """Network from ``channels`` and ``latent_dim`` inputs; σ starts near ``initial``."""
+        super().__init__()
+        self.floor = 1e-3
+        self.features = nn.Linear(channels, hidden)
+        self.state = nn.Linear(latent_dim, hidden, bias=False)
+        self.moments = nn.Linear(hidden, 2 * latent_dim)
+        with torch.no_grad():
+            self.moments.weight[latent_dim:] *= ROOT_SCALE
+            self.moments.bias[latent_dim:] = initial**0.5
+
+    def forward(
+        self, features: Float[Tensor, "*batch hidden"], z: Float[Tensor, "*batch latent"]
+    ) -> tuple[Float[Tensor, "*batch latent"], Float[Tensor, "*batch latent"]]:
+        """Mean and standard deviation of ε̂_{t+1}."""
+        hidden = torch.relu(features + self.state(z))
+        mean, root = self.moments(hidden).chunk(2, dim=-1)
+        return mean, root.square() + self.floor
+
+
+class _Filter(torch.autograd.Function):
+    """The recurrence ε̂_{t+1} = μ + σ η, s_{t+1} = s_t A + drive_t + ε̂_{t+1} G and its adjoint."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        features: Tensor,
+        noise: Tensor,
+        state: Tensor,
+        drive: Tensor,
+        transition: Tensor,
+        gain: Tensor,
+        state_weight: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        floor: float,
+    ) -> tuple[Tensor, Tensor]:
+        steps, latent = noise.shape[0], noise.shape[2]
+        s = torch.empty_like(drive)
+        h, ε, σ = torch.empty_like(features), torch.empty_like(noise), torch.empty_like(noise)
+        m = noise.new_empty(*noise.shape[:2], 2 * latent)
+        s[0] = state
+        lift, head = _lift(state_weight, state.shape[1]).t(), weight.t()
+        least = noise.new_full((), floor)
+        for t in range(steps):
+            torch.addmm(features[t], s[t], lift, out=h[t]).clamp_min_(0)
+            μ, root = torch.addmm(bias, h[t], head, out=m[t]).split(latent, 1)
+            torch.addcmul(least, root, root, out=σ[t])
+            torch.addcmul(μ, σ[t], noise[t], out=ε[t])
+            if t + 1 < steps:
+                torch.addmm(drive[t], s[t], transition, out=s[t + 1]).addmm_(ε[t], gain)
+        ctx.save_for_backward(s, h, m, ε, noise, transition, gain, state_weight, weight)
+        return ε, σ
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        s, h, m, ε, noise, transition, gain, state_weight, weight = ctx.saved_tensors
+        g_ε, g_σ = grads
+        steps, latent = noise.shape[0], noise.shape[2]
+        root2 = 2 * m[..., latent:]
+        slope, direct = root2 * noise, root2 * g_σ
+        lift, back, out = _lift(state_weight, s.shape[2]), transition.t(), gain.t()
+        λ, g_h, g_m = torch.zeros_like(s), h.sign(), torch.empty_like(m)
+        g_state = torch.zeros_like(s[0])
+        for t in range(steps - 1, -1, -1):
+            μ, root = g_m[t].split(latent, 1)
+            μ.copy_(torch.addmm(g_ε[t], λ[t], out))
+            torch.addcmul(direct[t], μ, slope[t], out=root)
+            g_h[t].mul_(g_m[t] @ weight)
+            before = λ[t - 1] if t else g_state
+            torch.mm(λ[t], back, out=before).addmm_(g_h[t], lift)
+        g_transition = _contract(s, λ) if ctx.needs_input_grad[4] else None
+        g_lift = _contract(g_h, s)[:, :latent]
+        g_bias = g_m.flatten(0, 1).sum(0)
+        return (
+            g_h,
+            None,
+            g_state,
+            λ,
+            g_transition,
+            _contract(ε, λ),
+            g_lift,
+            _contract(g_m, h),
+            g_bias,
+            None,
+        )
+
+
+def _lift(weight: Tensor, states: int) -> Tensor:
+    """The noise network sees z, not ż: zero columns for the rest of the state."""
+    return nn.functional.pad(weight, (0, states - weight.shape[1]))
+
+
+def _contract(left: Tensor, right: Tensor) -> Tensor:
+    return left.flatten(0, 1).t() @ right.flatten(0, 1)
+
+
+class FilteringNoise(TorchDistribution):
+    r"""q(ε̂_{2:T} | x, s_1): ε̂_{t+1} ~ N(μ(x_{t+1}, z_t), σ²(x_{t+1}, z_t)), (79), (84).
+
+    The states between follow s_{t+1} = s_t A + drive_t + ε̂_{t+1} G. A draw is one recurrence in
+    plain torch with its adjoint written out; its moments are kept, so that its log density and its
+    divergence from a Gaussian prior cost nothing more.
+    """
+
+    has_rsample = True
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+    support = constraints.independent(constraints.real, 2)
+
+    def __init__(
+        self,
+        network: NoiseNetwork,
+        features: Float[Tensor, "step window hidden"],
+        state: Float[Tensor, "window state"],
+        drive: Float[Tensor, "step window state"],
+        transition: Float[Tensor, "state state"],
+        gain: Float[Tensor, "latent state"],
+    ) -> None:
+        """Noise of ``window`` sub-sequences, each ``step`` + 1 frames long."""
+        self.network, self.features, self.state = network, features, state
+        self.drive, self.transition, self.gain = drive, transition, gain
+        self._kept: tuple[Tensor, Tensor, Tensor] | None = None
+        event = (features.shape[0], gain.shape[0])
+        super().__init__(state.shape[:1], torch.Size(event), validate_args=False)
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> FilteringNoise:
+        """The distribution itself: its windows are independent already."""
+        if torch.Size(batch_shape) != self.batch_shape:
+            raise ValueError(f"batch shape {batch_shape} for {tuple(self.batch_shape)} windows")
+        return self
+
+    def rsample(
+        self, sample_shape: Any = (), noise: Tensor | None = None
+    ) -> Float[Tensor, "window step latent"]:
+        """One reparameterised draw; ``noise`` η replaces the standard normal numbers."""
+        if tuple(sample_shape):
+            raise ValueError(f"one draw at a time; got sample_shape {tuple(sample_shape)}")
+        shape = (len(self.features), len(self.state), len(self.gain))
+        η = torch.randn(shape, dtype=self.state.dtype, device=self.state.device)
+        η = η if noise is None else noise
+        net = self.network
+        ε, σ = _Filter.apply(  # type: ignore[no-untyped-call]
+            self.features,
+            η,
+            self.state,
+            self.drive,
+            self.transition,
+            self.gain,
+            net.state.weight,
+            net.moments.weight,
+            net.moments.bias,
+            net.floor,
+        )
+        value: Tensor = ε.transpose(0, 1)
+        self._kept = value, η, σ
+        return value
+
+    def log_prob(self, value: Float[Tensor, "window step latent"]) -> Float[Tensor, " window"]:
+        """Log density of ``value``, summed over steps and dimensions."""
+        if self._kept is not None and value is self._kept[0]:
+            _, η, σ = self._kept
+            return _log_normal(η, σ)
+        mean, std = self.moments(value)
+        return _log_normal((value.transpose(0, 1) - mean) / std, std)
+
+    def moments(
+        self, value: Float[Tensor, "window step latent"]
+    ) -> tuple[Float[Tensor, "step window latent"], Float[Tensor, "step window latent"]]:
+        """Mean and standard deviation of every step along the states that ``value`` leads to."""
+        added = self.drive + value.transpose(0, 1) @ self.gain
+        states = [self.state]
+        for t in range(len(added) - 1):
+            states.append(torch.addmm(added[t], states[-1], self.transition))
+        z = torch.stack(states)[..., : len(self.gain)]
+        mean, std = self.network(self.features, z)
+        return mean, std
+
+    def kept_moments(self) -> tuple[Tensor, Tensor]:
+        """Moments along the last draw, shape (step, window, latent)."""
+        if self._kept is None:
+            raise ValueError("no draw has been made")
+        value, η, σ = self._kept
+        return value.transpose(0, 1) - σ * η, σ
+
+
+def _log_normal(η: Tensor, σ: Tensor) -> Tensor:
+    constant = 0.9189385332046727 * η.shape[0] * η.shape[2]
+    return -(0.5 * η.square() + σ.log()).sum((0, 2)) - constant
+
+
+@kl.register_kl(FilteringNoise, torch.distributions.Independent)  # type: ignore[untyped-decorator]
+def _kl_filtering_prior(q: FilteringNoise, p: torch.distributions.Independent[Any]) -> Tensor:
+    """KL of every step given the state it starts from, along the draw: no noise of its own."""
+    if not isinstance(p.base_dist, torch.distributions.Normal) or p.event_shape != q.event_shape:
+        raise NotImplementedError
+    mean, std = q.kept_moments()
+    each = kl.kl_divergence(
+        torch.distributions.Normal(mean.transpose(0, 1), std.transpose(0, 1), validate_args=False),
+        p.base_dist,
+    )
+    return each.sum((1, 2))

@@ -1,0 +1,156 @@
+"""Gaussian mixtures over whole latent paths, and their exact conditioning on the frames seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+__all__ = ["Conditioned", "PathPrior"]
+
+BANDWIDTHS = (0.1, 0.3, 0.6, 1.0)
+SHRINKAGES = (0.01, 0.03, 0.1, 0.3, 1.0)
+JITTER = 1e-8
+
+
+@dataclass(frozen=True)
+class PathPrior:
+    r"""A mixture over paths z_{1:T} with a component around every known movement.
+
+    p(z) = 1/M Σ_i N(z̄ + √(1−h²)(z_i − z̄), h² ((1−λ) S + λ R) + N): S is the covariance of the
+    known paths z_i = Φ u_i, R that of independent parameters u pushed through the same linear
+    response Φ, N that of the process noise (West 1993). h = 1 is one Gaussian, a small h a kernel
+    estimate that stays near the movements known. Observed frames are y_t ~ N(z_t, E).
+    """
+
+    paths: Float[Tensor, "movement time latent"]
+    spread: Float[Tensor, "latent time time"]
+    process: Float[Tensor, "time latent time latent"]
+    observation: Float[Tensor, "latent latent"]
+    bandwidth: float = 0.3
+    shrinkage: float = 0.1
+
+    @property
+    def means(self) -> Float[Tensor, "movement time latent"]:
+        """Means of the components."""
+        centre = self.paths.mean(0)
+        return centre + math.sqrt(1 - self.bandwidth**2) * (self.paths - centre)
+
+    @property
+    def covariance(self) -> Float[Tensor, "time latent time latent"]:
+        """Covariance that all components share."""
+        movements, time, latent = self.paths.shape
+        smooth = torch.zeros(time, latent, time, latent, dtype=self.paths.dtype)
+        for d in range(latent):
+            smooth[:, d, :, d] = self.spread[d]
+        shared = self.shrinkage * smooth
+        if movements > 1:
+            apart = (self.paths - self.paths.mean(0)) / math.sqrt(movements - 1)
+            shared = shared + (1 - self.shrinkage) * torch.einsum("mti,msj->tisj", apart, apart)
+        return self.bandwidth**2 * shared + self.process
+
+    def condition(
+        self,
+        seen: Float[Tensor, "*batch time latent"],
+        where: Bool[Tensor, " time"],
+        extra: Float[Tensor, "*batch time latent latent"] | None = None,
+    ) -> Conditioned:
+        """p(z_{1:T} | y_t, t where seen): new means, weights and covariance.
+
+        ``extra`` observation noise of some sequences costs a factorisation of each; without it one
+        factorisation serves all.
+        """
+        time, latent = where.shape[0], self.observation.shape[0]
+        full = self.covariance.reshape(time * latent, time * latent)
+        rows = where.repeat_interleave(latent).nonzero()[:, 0]
+        noise = self.observation if extra is None else self.observation + extra[..., where, :, :]
+        factor = _cholesky(full[rows][:, rows] + _block_diagonal(noise, int(where.sum())))
+        half = torch.linalg.solve_triangular(factor, full[rows], upper=False)
+        means = self.means.flatten(1)
+        apart = seen.flatten(-2)[..., None, rows] - means[:, rows]
+        white = torch.linalg.solve_triangular(factor, apart.mT, upper=False).mT
+        return Conditioned(
+            means=(means + white @ half).unflatten(-1, (time, latent)),
+            log_weights=torch.log_softmax(-0.5 * white.square().sum(-1), dim=-1),
+            covariance=full - half.mT @ half,
+        )
+
+    def tuned(self, seen: Sequence[int]) -> Self:
+        """Bandwidth and shrinkage with the best density of each movement's future, left out.
+
+        The future is every frame after the first ``seen`` ones, judged frame by frame. A single
+        movement leaves nothing to compare: the defaults stay.
+        """
+        if len(self.paths) < 3:
+            return self
+        options = [
+            replace(self, bandwidth=h, shrinkage=s) for h, s in product(BANDWIDTHS, SHRINKAGES)
+        ]
+        return max(options, key=lambda prior: prior.left_out(seen))
+
+    def left_out(self, seen: Sequence[int]) -> float:
+        """Mean log density of each movement's future under the others."""
+        count, time = self.paths.shape[:2]
+        total = 0.0
+        for i in range(count):
+            others = replace(self, paths=self.paths[torch.arange(count) != i])
+            for k in seen:
+                given = others.condition(self.paths[i], torch.arange(time) < k)
+                total += float(given.log_density(self.paths[i], self.observation)[k:].mean())
+        return total / (count * len(seen))
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """A mixture over paths after frames were seen; all components share the covariance."""
+
+    means: Float[Tensor, "*batch component time latent"]
+    log_weights: Float[Tensor, "*batch component"]
+    covariance: Float[Tensor, "*batch path path"]
+
+    def sample(self, draws: int) -> Float[Tensor, "sample *batch time latent"]:
+        """Joint draws of whole paths."""
+        time, latent = self.means.shape[-2:]
+        picks = torch.distributions.Categorical(logits=self.log_weights).sample((draws,))
+        means = self.means.expand(draws, *self.means.shape)
+        index = picks[..., None, None, None].expand(*picks.shape, 1, time, latent)
+        centre = means.gather(-3, index).squeeze(-3)
+        white = torch.randn(*picks.shape, time * latent, dtype=self.covariance.dtype)
+        moved = white.movedim(0, -2) @ _cholesky(self.covariance).mT
+        return centre + moved.movedim(-2, 0).unflatten(-1, (time, latent))
+
+    def log_density(
+        self, path: Float[Tensor, "*batch time latent"], observation: Float[Tensor, "latent latent"]
+    ) -> Float[Tensor, "*batch time"]:
+        """Log marginal density of every frame of a path seen with noise."""
+        time, latent = self.means.shape[-2:]
+        blocks = self.covariance.unflatten(-1, (time, latent)).unflatten(-3, (time, latent))
+        each = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3) + observation
+        frames = torch.distributions.MultivariateNormal(
+            self.means, scale_tril=_cholesky(each).unsqueeze(-4), validate_args=False
+        )
+        joint: Tensor = frames.log_prob(path.unsqueeze(-3)) + self.log_weights[..., None]
+        return torch.logsumexp(joint, dim=-2)
+
+
+def _block_diagonal(
+    block: Float[Tensor, "*batch latent latent"], frames: int
+) -> Float[Tensor, "*batch path path"]:
+    """One block for all frames, or a block for each."""
+    latent = block.shape[-1]
+    each = block.expand(*block.shape[:-3], frames, latent, latent)
+    wide = each.unsqueeze(-2) * torch.eye(frames, dtype=block.dtype)[:, None, :, None]
+    return wide.flatten(-2).flatten(-3, -2)
+
+
+def _cholesky(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
+    scale = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
+    factor: Tensor = torch.linalg.cholesky((matrix + matrix.mT) / 2 + JITTER * scale * eye)
+    return factor

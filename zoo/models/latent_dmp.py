@@ -1,0 +1,166 @@
+"""What is generative in VAE-DMP: a linear latent state, driven by a DMP, decoded frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from zoo.dynamics.dmp import (
+    Response,
+    Transformation,
+    discrete_basis,
+    input_vector,
+    transition_matrix,
+)
+from zoo.nn.mlp import mlp
+from zoo.types import Batch, Layout
+
+__all__ = ["Config", "LatentDmp"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """``latent_dim`` d', ``hidden`` decoder units, ``kernels`` of the forcing term, α (β = α/4).
+
+    ``w_scale`` and ``velocity_scale`` are the prior standard deviations of w and ż_1, in units of
+    the acceleration αβ and of the movement's length; ``noise_scale`` is where w_ε starts, in the
+    same unit as w; ``output_std`` where the constant output spread starts, in scaled units.
+    """
+
+    latent_dim: int = 5
+    hidden: int = 200
+    kernels: int = 50
+    alpha: float = 25.0
+    transition_hidden: int = 32
+    w_scale: float = 3.0
+    velocity_scale: float = 10.0
+    noise_scale: float = 0.3
+    output_std: float = 0.3
+    output_floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse empty layers and scales."""
+        for name in ("latent_dim", "hidden", "transition_hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
+        if self.kernels < 2:
+            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
+        for name in ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+
+
+class LatentDmp(nn.Module):
+    """Networks, constants and densities' parameters of :class:`~zoo.models.vae_dmp.VaeDmp`."""
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float32
+
+    basis: Tensor
+    step_matrix: Tensor
+    step_input: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """A model of movements of ``layout.frames`` frames, all of one length."""
+        super().__init__()
+        self.config, self.frames = config, _frames(layout)
+        self.latent_dim, self.kernels = config.latent_dim, config.kernels
+        channels, latent = len(layout.channels), config.latent_dim
+        self.system = Transformation(config.alpha, config.alpha / 4, 1.0, 1 / (self.frames - 1))
+        self.decoder = mlp([latent, config.hidden, channels])
+        self.g = mlp([latent, config.transition_hidden, latent], "tanh")
+        nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
+        self.w_noise = nn.Parameter(config.noise_scale * torch.eye(latent))
+        self.output_root = nn.Parameter(torch.full((channels,), config.output_std**0.5))
+        eye = torch.eye(latent, dtype=torch.float64)
+        matrix = transition_matrix(self.system).T.contiguous()
+        self.register_buffer("basis", self.kernels_at(self.frames - 1).to(self.w_noise))
+        self.register_buffer("step_matrix", torch.kron(matrix, eye).to(self.w_noise))
+        step_input = torch.kron(input_vector(self.system)[None], eye)
+        self.register_buffer("step_input", step_input.to(self.w_noise))
+
+    @property
+    def output_std(self) -> Float[Tensor, " channel"]:
+        """The constant spread of every channel, (83)."""
+        return self.output_root.square() + self.config.output_floor
+
+    @property
+    def transition(self) -> Float[Tensor, "state state"]:
+        """A of (76) for row vectors (z*, ż)."""
+        return self.step_matrix
+
+    def embed(self, z: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch latent"]:
+        """z* = g(z)."""
+        moved: Tensor = z + self.g(z)
+        return moved
+
+    def noise_gain(self) -> Float[Tensor, "latent state"]:
+        """G: ε = ε̂ w_ε enters the next state as (77) says."""
+        return (self.system.stiffness * self.w_noise) @ self.step_input
+
+    def initial_state(
+        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
+    ) -> Float[Tensor, "window state"]:
+        """(z*_1, ż_1) of a window's first frame."""
+        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
+
+    def forces(
+        self,
+        w: Float[Tensor, "sequence kernel latent"],
+        goal: Float[Tensor, "sequence latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "step window latent"]:
+        """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
+        steps = batch.values.shape[1] - 1
+        pull = self.embed(goal) + torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+        at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
+        row = at * pull.shape[1] + batch.sequence
+        picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
+        return picked.view(steps, len(batch), -1)
+
+    def drive(
+        self,
+        w: Float[Tensor, "sequence kernel latent"],
+        goal: Float[Tensor, "sequence latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "step window state"]:
+        """What goal and forcing term add to the state in every step, (77)."""
+        return self.forces(w, goal, batch) @ self.step_input
+
+    def path(
+        self,
+        z: Float[Tensor, "window latent"],
+        velocity: Float[Tensor, "window latent"],
+        w: Float[Tensor, "sequence kernel latent"],
+        goal: Float[Tensor, "sequence latent"],
+        ε: Float[Tensor, "window step latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "window time latent"]:
+        """z*_{1:T} by the linear response of (75): no loop over time."""
+        steps = batch.values.shape[1]
+        response = Response.of(self.system, steps, z.dtype, z.device)
+        noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
+        force = self.forces(w, goal, batch) + noise
+        start = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
+        states = response.product(start.flatten(1), force.flatten(1))
+        return states[0].view(steps, len(batch), -1).transpose(0, 1)
+
+    def kernels_at(self, steps: int, duration: float = 1.0) -> Float[Tensor, "step kernel"]:
+        """Ψ of the first ``steps`` steps of a movement ``duration`` times as long, in float64."""
+        time = torch.arange(steps, dtype=torch.float64)
+        whole = (self.frames - 1) * duration
+        return discrete_basis(time, kernels=self.kernels, duration=whole)
+
+
+def _frames(layout: Layout) -> int:
+    if layout.frames is None or layout.frames < 3:
+        raise ValueError(
+            "vae-dmp needs movements of one common length of at least 3 frames; got "
+            f"{'several lengths' if layout.frames is None else layout.frames}: "
+            "bring them to one by data.resampled(70) or data.windows(70)"
+        )
+    return layout.frames
