@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NoiseDivergenceWarning
-from zoo.inference.evidence import Pattern, collapsed, pairs_of, patterns, sparse_posterior
+from zoo.inference.collapsed import Collapsed
+from zoo.inference.evidence import pairs_of, patterns
 from zoo.inference.marginal import evaluator, maximise
 from zoo.nn.gaussian import joint_draws
 from zoo.nn.kernels import median_distance, squared_distances, squared_exponential
@@ -75,11 +76,10 @@ class Config:
 
 
 class _Training(NamedTuple):
-    """What only training needs: data, their patterns, and distances where they stay the same."""
+    """What only training needs: inputs, the bound of their targets, and squared distances."""
 
     inputs: Tensor
-    targets: Tensor
-    groups: tuple[Pattern, ...]
+    bound: Collapsed
     among: Tensor
     across: Tensor
 
@@ -146,8 +146,7 @@ class SparseGaussianProcess(nn.Module):
         self._set_inducing(data.inputs[chosen].to(self.dtype))
         self._training = _Training(
             data.inputs,
-            data.targets.to(self.dtype),
-            patterns(data.mask),
+            Collapsed(data.targets.to(self.dtype), patterns(data.mask), self.config.bound),
             *self._distances(data.inputs),
         )
         with torch.no_grad():
@@ -157,10 +156,7 @@ class SparseGaussianProcess(nn.Module):
     def objective(self) -> Float[Tensor, ""]:
         """Minus the collapsed bound on the log evidence, summed over targets."""
         training = self._need_training()
-        k_uu, k_uf = self._covariances(training)
-        return collapsed(
-            k_uu, k_uf, self.noise, training.targets, training.groups, self.config.bound
-        )
+        return training.bound(*self._geometry(training), self.noise)
 
     def settle(self) -> None:
         """Keep q(u) and σ_f² under the final hyperparameters; compare with the other bound."""
@@ -236,20 +232,22 @@ class SparseGaussianProcess(nn.Module):
         """Squared distances among the inducing inputs and from them to all others."""
         inducing = self.inducing.detach()
         among = squared_distances(inducing, inducing)
-        return among.fill_diagonal_(0), squared_distances(inducing, inputs)
+        return among.fill_diagonal_(0), squared_distances(inputs, inducing)
 
     def _need_training(self) -> _Training:
         if self._training is None:
             raise RuntimeError("the evidence needs training data; call condition(data) first")
         return self._training
 
-    def _covariances(self, training: _Training) -> tuple[Tensor, Tensor]:
-        """K_uu with its jitter and K_uf, of unit signal variance."""
+    def _geometry(self, training: _Training) -> tuple[Tensor, Tensor, Tensor]:
+        """K_uu with its jitter, and the distances to all inputs with the length they are over."""
         if self.config.learn_inducing or self.config.ard:
             k_uu = self._kernel(self.inducing, self.inducing)
-            return self._jittered(k_uu), self._kernel(self.inducing, training.inputs)
+            inducing = self.inducing / self.length
+            across = squared_distances(training.inputs / self.length, inducing)
+            return self._jittered(k_uu), across, torch.zeros_like(self.noise)
         k_uu = squared_exponential(training.among, self.log_length[0])
-        return self._jittered(k_uu), squared_exponential(training.across, self.log_length[0])
+        return self._jittered(k_uu), training.across, self.log_length[0]
 
     def _jittered(self, k_uu: Tensor) -> Tensor:
         return k_uu + self.config.jitter * torch.eye(len(k_uu), dtype=k_uu.dtype)
@@ -260,21 +258,18 @@ class SparseGaussianProcess(nn.Module):
 
     @torch.no_grad()
     def _keep_posterior(self, training: _Training) -> None:
-        k_uu, k_uf = self._covariances(training)
+        bound = training.bound
+        k_uu, across, log_length = self._geometry(training)
         self.factor = torch.linalg.cholesky(k_uu)
-        v = torch.linalg.solve_triangular(self.factor, k_uf, upper=False)
-        targets = training.targets
-        self.signal = targets.new_zeros(targets.shape[1])
-        self.mean = targets.new_zeros(len(v), targets.shape[1])
-        self.pattern = targets.new_zeros(targets.shape[1])
-        kept = []
-        for i, (observed, group) in enumerate(training.groups):
-            which = list(group)
-            q = sparse_posterior(v, self.noise, targets[:, which], observed, self.config.bound)
+        found = bound.posteriors(bound.project(self.factor, across, log_length), self.noise)
+        count = bound.targets.shape[1]
+        self.signal, self.pattern = k_uu.new_zeros(count), k_uu.new_zeros(count)
+        self.mean = k_uu.new_zeros(len(k_uu), count)
+        for i, (q, (observed, targets)) in enumerate(zip(found, bound.groups, strict=True)):
+            which = list(targets)
             self.signal[which], self.mean[:, which] = q.quadratic / observed.sum(), q.mean
             self.pattern[which] = float(i)
-            kept.append(q.factor)
-        self.information = torch.stack(kept)
+        self.information = torch.stack([q.factor for q in found])
 
     def _compare(self, training: _Training) -> None:
         """Fit the variational bound from here, on the same distances, and compare the noise."""
@@ -285,7 +280,8 @@ class SparseGaussianProcess(nn.Module):
         if self.config.learn_inducing:
             among, across = other._distances(training.inputs)
             training = training._replace(among=among, across=across)
-        other._training = training
+        mine = training.bound
+        other._training = training._replace(bound=Collapsed(mine.targets, mine.groups, "vfe"))
         with torch.no_grad():
             other.log_length.copy_(self.log_length)
             other.log_noise.copy_(self.log_noise)

@@ -12,24 +12,26 @@ from torch.autograd.function import once_differentiable
 
 __all__ = ["median_distance", "squared_distances", "squared_exponential"]
 
+_BLOCK = 1 << 21
+
 
 def squared_distances(
-    a: Float[Tensor, "a feature"], b: Float[Tensor, "b feature"], *, chunk: int = 2048
+    a: Float[Tensor, "a feature"], b: Float[Tensor, "b feature"]
 ) -> Float[Tensor, "a b"]:
-    """‖a_i − b_j‖² in float64, one matrix product over rows of ``b`` that need not fit twice.
+    """‖a_i − b_j‖² in float64, one matrix product over blocks of ``a`` of some 16 MB.
 
-    Both are centred on the mean of ``a``, which keeps the product's cancellation small.
+    Both are centred on the mean of ``b``, which keeps the product's cancellation small.
 
     >>> squared_distances(torch.tensor([[0.0], [1.0]]), torch.tensor([[3.0]])).tolist()
     [[9.0], [4.0]]
     """
     if a.shape[1] != b.shape[1]:
-        raise ValueError(f"inputs have {b.shape[1]} features; {a.shape[1]} are needed")
-    centre = a.detach().double().mean(0)
-    rows = a.double() - centre
-    norms = rows.square().sum(1, keepdim=True)
-    parts = [_distances(rows, norms, part.double() - centre) for part in b.split(chunk)]
-    return torch.cat(parts, 1) if parts else rows.new_zeros(len(rows), 0)
+        raise ValueError(f"inputs have {a.shape[1]} features; {b.shape[1]} are needed")
+    centre = b.detach().double().mean(0)
+    others = b.double() - centre
+    norms = others.square().sum(1)
+    size = max(1, _BLOCK // a.shape[1])
+    return torch.cat([_distances(part.double() - centre, others, norms) for part in a.split(size)])
 
 
 def squared_exponential(
@@ -50,9 +52,9 @@ def median_distance(distances: Float[Tensor, "a b"]) -> Float[Tensor, ""]:
     return apart.median().sqrt() if len(apart) else distances.new_ones(())
 
 
-def _distances(rows: Tensor, norms: Tensor, others: Tensor) -> Tensor:
-    product = rows @ others.mT
-    return (norms + others.square().sum(1) - 2 * product).clamp_min(0)
+def _distances(rows: Tensor, others: Tensor, norms: Tensor) -> Tensor:
+    own: Tensor = torch.linalg.vecdot(rows, rows)[:, None]
+    return (own + torch.addmm(norms, rows, others.mT, alpha=-2)).clamp_min(0)
 
 
 class _SquaredExponential(Function):
