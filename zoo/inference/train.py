@@ -76,7 +76,16 @@ def train_model(
     if guide is not None and isinstance(model, LearnsPrior):
         with seeded(session.seed, session.device), torch.no_grad():
             model.learn_prior(whole(train), GuidePosterior(guide))
+    _settle(model)
     return history
+
+
+def _settle(model: nn.Module) -> None:
+    """Lay statistics out as a file will: the same bits in, the same bits out of every product."""
+    for module in model.modules():
+        for name, buffer in module._buffers.items():
+            if buffer is not None and not buffer.is_contiguous():
+                module._buffers[name] = buffer.contiguous()
 
 
 def _exact(
