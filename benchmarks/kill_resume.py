@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ SETTINGS = {
     "hidden": 40,
 }
 AGAIN = 0.3
+PAUSES = (0.0, 0.05, 60.0)
 
 
 def movements(seed: int) -> Sequences:
@@ -54,8 +56,11 @@ def movements(seed: int) -> Sequences:
     )
 
 
-def train(model: str, folder: Path) -> None:
-    """Train or resume in ``folder`` and leave there the digest of all that training made."""
+def train(model: str, folder: Path, pause: float) -> None:
+    """Train or resume in ``folder`` and leave there the digest of all that training made.
+
+    Checkpoints are written inside epochs every ``pause`` seconds.
+    """
     data, held = movements(0), movements(1)
     made = _create(model, data)
     history = fit_svi(
@@ -66,7 +71,7 @@ def train(model: str, folder: Path) -> None:
         val=held.to(dtype=made.dtype),
         folder=folder,
         resume="auto",
-        checkpoint_seconds=0.05,
+        checkpoint_seconds=pause,
     )
     rows = [{k: v for k, v in row.items() if k != "seconds"} for row in history]
     total = hashlib.sha256(json.dumps(rows).encode())
@@ -115,7 +120,8 @@ def _kill_and_resume(
     folder.mkdir()
     killed = False
     while not killed or rng.random() < AGAIN:
-        child = _fork(lambda: train(model, folder))
+        pause = rng.choice(PAUSES)
+        child = _fork(partial(train, model, folder, pause))
         time.sleep(rng.uniform(0.0, duration))
         os.kill(child, signal.SIGKILL)
         if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
@@ -125,7 +131,7 @@ def _kill_and_resume(
             return
         else:
             _empty(folder)
-    _finish(_fork(lambda: train(model, folder)))
+    _finish(_fork(partial(train, model, folder, 60.0)))
 
 
 def _remains(folder: Path) -> str:
@@ -145,7 +151,7 @@ def _remains(folder: Path) -> str:
 def _uninterrupted(model: str, folder: Path) -> tuple[str, float]:
     folder.mkdir()
     begin = time.monotonic()
-    _finish(_fork(lambda: train(model, folder)))
+    _finish(_fork(partial(train, model, folder, 60.0)))
     return (folder / "digest").read_text(), time.monotonic() - begin
 
 

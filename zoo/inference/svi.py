@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections.abc import Callable
@@ -12,20 +11,19 @@ from typing import Literal
 
 import pyro
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import TrainingError, TrainingWarning
 from zoo.inference import checkpoint
 from zoo.inference.collapse import warn_of_collapse
-from zoo.inference.elbo import Bound, check, tight_bound
 from zoo.inference.history import History, Log, Row
-from zoo.inference.loader import Loader, stream
+from zoo.inference.loader import Loader
 from zoo.inference.progress import TrainingBar
 from zoo.inference.state import FIGURES, Best, Parts, Place, State, fingerprint
-from zoo.inference.tempering import learning_rate, ramp
+from zoo.inference.steps import NotFiniteError, Steps
+from zoo.inference.tempering import ramp
 from zoo.strategies import Svi
-from zoo.types import Batch
 
 __all__ = ["fit_svi"]
 
@@ -76,10 +74,6 @@ def fit_svi(
     return training.state.history
 
 
-class _NotFiniteError(Exception):
-    """What was not finite, by name."""
-
-
 class _Training:
     def __init__(
         self,
@@ -91,18 +85,15 @@ class _Training:
         seed: int,
         device: str,
     ) -> None:
-        self.model, self.guide, self.strategy = model, guide, strategy
-        self.seed, self.device = seed, torch.device(device)
+        self.strategy = strategy
         self.loader = _loader(train, strategy, seed, device)
         self.val = None if val is None else _loader(val, strategy, seed, device)
-        self._first_pass()
-        self.parameters = _parameters(model, guide)
-        self.optimizer = torch.optim.Adam(
-            self.parameters.values(), lr=strategy.learning_rate, fused=True
-        )
-        self.parts = Parts(model, guide, self.optimizer)
+        self.steps = Steps(model, guide, self.loader, strategy, seed=seed, device=device)
+        self.parts = Parts(model, guide, self.steps.optimizer)
         self.state = State(self.parts.tensors())
-        self.made_of = fingerprint(self.parameters, strategy, seed, training=train, validation=val)
+        self.made_of = fingerprint(
+            self.steps.parameters, strategy, seed, training=train, validation=val
+        )
 
     def keep_in(self, folder: Path | None, log: Log, seconds: float) -> None:
         self.folder, self.log, self.seconds = folder, log, seconds
@@ -125,7 +116,7 @@ class _Training:
             while not self.state.finished:
                 try:
                     self._epoch(bar, on_epoch)
-                except _NotFiniteError as what:
+                except NotFiniteError as what:
                     self._go_back(str(what))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(self._interrupted()) from None
@@ -144,51 +135,22 @@ class _Training:
 
     def _steps(self, c: float, beta: float, bar: TrainingBar) -> None:
         state, place = self.state, self.state.place
-        self.model.train()
-        self.guide.train()
+        self.steps.mode(training=True)
         start = self.parts.tensors() if place.batch == 0 else None
         for batch in self.loader.epoch(place.epoch, place.batch):
-            figures = self._step(batch, c, beta)
+            figures = self.steps.take(batch, state.place, tries=state.tries, c=c, beta=beta)
             if start is not None:
                 state.good, state.good_place, start = start, place, None
             state.place = state.place.after(figures)
             bar.step(place.epoch, state.place.batch)
             self._save_after(self.seconds)
 
-    def _step(self, batch: Batch, c: float, beta: float) -> tuple[float, ...]:
-        """One step of the optimiser; loss, reconstruction, KL and gradient norm of the batch."""
-        self._seed_noise("step", self.state.place.step, self.state.tries)
-        for parameter in self.parameters.values():
-            parameter.grad = None
-        terms = tight_bound(self.model, self.guide, batch, c=c, beta=beta)
-        (terms.loss / batch.total).backward()
-        norm = self._clip()
-        parts = (terms.loss.detach(), terms.reconstruction, terms.kl, norm)
-        *sums, length = torch.stack(parts).tolist()
-        if not all(map(math.isfinite, (*sums, length))):
-            raise _NotFiniteError(self._blame(terms))
-        self.optimizer.param_groups[0]["lr"] = self._rate(self.state.place.step)
-        self.optimizer.step()
-        share = len(batch) / batch.total
-        return *(value * share for value in sums), length * len(batch)
-
-    def _clip(self) -> Tensor:
-        gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
-        norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-        if self.strategy.clip is not None:
-            shrink = torch.clamp(self.strategy.clip / norm, max=1.0)
-            torch._foreach_mul_(gradients, shrink)
-        return norm
-
-    def _rate(self, step: int) -> float:
-        done = step / (self.strategy.epochs * len(self.loader))
-        return learning_rate(self.strategy, done) * 0.5**self.state.tries
-
     def _row(self, c: float, beta: float) -> Row:
         sums = zip(FIGURES, self.state.place.sums, strict=True)
         means = {name: value / self.loader.total for name, value in sums}
+        rate = self.steps.rate(self.state.place.step - 1, self.state.tries)
         row: Row = {"epoch": self.state.place.epoch, **means, "c": c, "beta": beta}
-        return row | {"lr": self._rate(self.state.place.step - 1), "val_elbo": None}
+        return row | {"lr": rate, "val_elbo": None}
 
     def _validate(self, row: Row) -> int:
         """Validate where it is due; how many validations have passed without progress."""
@@ -196,27 +158,13 @@ class _Training:
         due = epoch % self.strategy.validate_every == 0 or epoch == self.strategy.epochs
         if self.val is None or not due:
             return state.place.waited
-        row["val_elbo"] = elbo = self._plain_bound(self.val)
+        row["val_elbo"] = elbo = self.steps.plain_bound(self.val)
         if min(row["c"], row["beta"]) < 1.0:
             return 0
         if state.best is not None and elbo <= state.best.elbo:
             return state.place.waited + 1
         state.best, state.best_tensors = Best(epoch=epoch - 1, elbo=elbo), self.parts.modules()
         return 0
-
-    @torch.no_grad()
-    def _plain_bound(self, loader: Loader) -> float:
-        """The un-tempered bound per datum, on the same noise at every call."""
-        self.model.eval()
-        self.guide.eval()
-        self._seed_noise("validation")
-        total = 0.0
-        for batch in loader.sweep():
-            terms = tight_bound(self.model, self.guide, batch)
-            if broken := terms.broken():
-                raise _NotFiniteError(f"{', '.join(broken)} on the validation data")
-            total += terms.elbo.item() * len(batch) / batch.total
-        return total / loader.total
 
     def _report(self, row: Row, bar: TrainingBar, on_epoch: Callable[[Row], None] | None) -> None:
         self.state.history.rows.append(row)
@@ -239,9 +187,9 @@ class _Training:
         self.state.finished = True
         self._save()
         if self.state.place.step >= SETTLED:
-            self._seed_noise("collapse")
+            self.steps.noise("collapse")
             rows = self.loader.order(0)[: self.strategy.batch_size]
-            warn_of_collapse(self.model, self.guide, self.loader.take(rows))
+            warn_of_collapse(self.parts.model, self.parts.guide, self.loader.take(rows))
 
     def _save_after(self, seconds: float) -> None:
         if time.monotonic() - self.written >= seconds:
@@ -254,14 +202,6 @@ class _Training:
         self.state.save(self.folder, self.parts, self.made_of)
         self.written = time.monotonic()
         self.pause = (self.written - begin) / SHARE
-
-    def _blame(self, terms: Bound) -> str:
-        if broken := terms.broken():
-            return f"the bound's term {', '.join(broken)}"
-        for name, parameter in self.parameters.items():
-            if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
-                return f"the gradient of {name}"
-        return "the norm of the gradient"
 
     def _go_back(self, what: str) -> None:
         """Return to the last good state with half the step size, a bounded number of times."""
@@ -278,7 +218,7 @@ class _Training:
         self.parts.put(state.good)
         state.history.back_to(state.place.epoch)
         self.log.start(state.history)
-        rate = self._rate(state.place.step)
+        rate = self.steps.rate(state.place.step, state.tries)
         again = f"back to the start of epoch {state.place.epoch} with step size {rate:g}"
         warnings.warn(f"{where}: {again}", TrainingWarning, stacklevel=4)
 
@@ -287,19 +227,6 @@ class _Training:
         if self.folder is None or not checkpoint.exists(self.folder):
             return f"{where}; no checkpoint was kept"
         return f"{where}; resume='auto' goes on from the checkpoint in {self.folder}"
-
-    def _first_pass(self) -> None:
-        """Every check of Pyro on two data; guides that wait for their first call are built too."""
-        self.model.eval()
-        self.guide.eval()
-        self._seed_noise("check")
-        check(self.model, self.guide, self.loader.take(self.loader.order(0)[:2]))
-
-    def _seed_noise(self, *position: int | str) -> None:
-        seed = stream(self.seed, *position)
-        torch.default_generator.manual_seed(seed)
-        if self.device.type == "cuda":
-            torch.cuda.manual_seed(seed)
 
 
 def _loader(data: Sequences | Pairs, strategy: Svi, seed: int, device: str) -> Loader:
@@ -310,13 +237,6 @@ def _loader(data: Sequences | Pairs, strategy: Svi, seed: int, device: str) -> L
         stride=strategy.stride,
         seed=seed,
     )
-
-
-def _parameters(model: nn.Module, guide: nn.Module) -> dict[str, nn.Parameter]:
-    named = {f"model.{n}": p for n, p in model.named_parameters() if p.requires_grad}
-    known = set(map(id, named.values()))
-    rest = guide.named_parameters()
-    return named | {f"guide.{n}": p for n, p in rest if p.requires_grad and id(p) not in known}
 
 
 def _accelerators(device: str) -> list[torch.device]:
