@@ -38,6 +38,7 @@ class Sequences:
     in ``mask``. ``controls`` are known inputs of every frame (actions), with their own names.
     ``rate`` is in Hz; where ``time_normalised``, every movement was stretched to one length, and it
     is that of the mean duration. ``provenance`` is ``public``, ``thesis`` or ``simulated``.
+    ``notes`` say what a loader changed in the recording.
     """
 
     values: Float[Tensor, "sequence time channel"]
@@ -51,6 +52,7 @@ class Sequences:
     control_names: tuple[str, ...] = ()
     control_units: tuple[str, ...] = ()
     time_normalised: bool = False
+    notes: tuple[str, ...] = ()
     name: str = "sequences"
     provenance: str = "public"
 
@@ -67,6 +69,7 @@ class Sequences:
         control_names: Sequence[str] | None = None,
         control_units: str | Sequence[str] = "",
         time_normalised: bool = False,
+        notes: Sequence[str] = (),
         name: str = "sequences",
         provenance: str = "public",
     ) -> Self:
@@ -99,6 +102,7 @@ class Sequences:
             control_names=distinct_names(control_names, width, "control"),
             control_units=units_of(control_units, width),
             time_normalised=time_normalised,
+            notes=tuple(notes),
             name=name,
             provenance=provenance,
         )
