@@ -43,7 +43,7 @@ def normal_score(location: Tensor, scale: Tensor | None, value: Tensor) -> Tenso
     flat = rows.reshape(-1, location[0].numel())
     out = torch.empty_like(flat)
     for part, centre, width in _blocks(location, scale, flat.shape[0]):
-        out[:, part] = _score(centre, width, flat[:, None, part])
+        out[:, part] = _score(centre, width, flat[:, None, part].to(centre))
     return out.reshape(rows.shape)
 
 
@@ -93,24 +93,24 @@ def _score(centre: Tensor, width: Tensor | None, value: Tensor) -> Tensor:
     if width is None:
         half = 0.5 / centre.shape[0]
         below = (centre <= value).to(centre.dtype).mean(-2)
-        score: Tensor = torch.special.ndtri(below.clamp(half, 1 - half))
-        return score
-    reduced = (value - centre) / (width * math.sqrt(2))
-    lower, upper = torch.erfc(-reduced).mean(-2) / 2, torch.erfc(reduced).mean(-2) / 2
-    tail = torch.special.ndtri(torch.minimum(lower, upper)).clamp(min=-_FARTHEST)
-    return torch.where(lower < upper, tail, -tail)
+        return _normal_score(below.clamp(half, 1 - half))
+    side = torch.where(value < centre.mean(0), -1.0, 1.0)
+    reduced = (value - centre) * side / (width * math.sqrt(2))
+    tail = _normal_score(torch.erfc(reduced).mean(-2) / 2).clamp(min=-_FARTHEST)
+    return -side.squeeze(-2) * tail
 
 
 def _solve(centre: Tensor, width: Tensor, score: float) -> Tensor:
     """Newton's method on the normal score, kept between the components' own quantiles."""
     ends = centre + score * width
     low, high = ends.amin(0), ends.amax(0)
-    spread = (width.square().mean(0) + centre.var(0, unbiased=False)).sqrt()
-    x = (centre.mean(0) + score * spread).clamp(low, high)
+    mean = centre.mean(0)
+    spread = (width.square() + (centre - mean).square()).mean(0).sqrt()
+    x = (mean + score * spread).clamp(low, high)
     tolerance = 1e3 * torch.finfo(x.dtype).eps
     for _ in range(80):
         reduced = (x - centre) / width
-        reached = torch.special.ndtri(torch.erfc(-reduced / math.sqrt(2)).mean(0) / 2)
+        reached = _normal_score(torch.erfc(-reduced / math.sqrt(2)).mean(0) / 2)
         miss = reached - score
         if bool((miss.abs().le(tolerance) | (high - low).le(tolerance * spread)).all()):
             break
@@ -128,6 +128,11 @@ def _sorted_quantile(draws: Tensor, score: float) -> Tensor:
     below = min(int(place), draws.shape[0] - 1)
     above = min(below + 1, draws.shape[0] - 1)
     return torch.lerp(ordered[below], ordered[above], place - below)
+
+
+def _normal_score(level: Tensor) -> Tensor:
+    score: Tensor = torch.special.ndtri(level)
+    return score
 
 
 def _positive(scale: Tensor) -> Tensor:

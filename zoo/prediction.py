@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from statistics import NormalDist
 from typing import Any, Literal, Protocol, Self
 
@@ -47,6 +48,12 @@ class Predictive:
         if self.draws is not None and (not len(self.draws) or self.draws.shape[1:] != shape[1:]):
             got = tuple(self.draws.shape)
             raise ValueError(f"draws have shape {got}; (sample, *{tuple(shape[1:])}) is needed")
+
+    @property
+    def spread(self) -> Tensor | None:
+        """Standard deviation of every component; None for draws without noise."""
+        parts = [part.square() for part in (self.noise, self.epistemic) if part is not None]
+        return sum(parts[1:], parts[0]).sqrt() if parts else None
 
     def affine(self, scale: Tensor, shift: Tensor) -> Predictive:
         """The same distribution of ``scale * y + shift`` (both broadcast over the last axis)."""
@@ -135,7 +142,7 @@ class Prediction:
         frames = self.shape[self.axes.index("time")]
         return torch.arange(self.offset, self.offset + frames, dtype=torch.float64) / self.rate
 
-    @property
+    @cached_property
     def effective(self) -> Predictive | None:
         """The mixture after recalibration; None where only its quantiles are known."""
         return (
@@ -144,17 +151,17 @@ class Prediction:
             else self.recalibration.predictive(self.raw)
         )
 
-    @property
+    @cached_property
     def raw(self) -> Prediction:
         """This prediction as the model gave it, without recalibration."""
-        return replace(self, recalibration=None)
+        return self if self.recalibration is None else replace(self, recalibration=None)
 
-    @property
+    @cached_property
     def mean(self) -> Tensor:
         """Predictive mean."""
         return self.predictive.location.mean(0)
 
-    @property
+    @cached_property
     def aleatoric(self) -> Tensor:
         """Standard deviation of the observation noise."""
         self._need_spread()
@@ -163,17 +170,17 @@ class Prediction:
             return torch.zeros_like(self.mean)
         return p.noise.expand_as(p.location).square().mean(0).sqrt()
 
-    @property
+    @cached_property
     def epistemic(self) -> Tensor:
         """Standard deviation of the noise-free value."""
         self._need_spread()
         p = self._mixture()
-        variance = p.location.var(0, unbiased=False)
+        variance = (p.location - p.location.mean(0)).square().mean(0)
         if p.epistemic is not None:
             variance = variance + p.epistemic.expand_as(p.location).square().mean(0)
         return variance.sqrt()
 
-    @property
+    @cached_property
     def std(self) -> Tensor:
         """Predictive standard deviation; of a recalibrated prediction its calibrated one."""
         self._need_spread()
@@ -195,7 +202,7 @@ class Prediction:
         """Quantile at the level Φ(``score``), which reaches further into the tails."""
         self._need_spread()
         p = self._mixture()
-        return mixtures.quantile(p.location, _component_scale(p), score)
+        return mixtures.quantile(p.location, p.spread, score)
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
         """Central interval that holds ``level`` of the probability."""
@@ -211,19 +218,19 @@ class Prediction:
         if self.recalibration is not None:
             return self.recalibration.cdf(self.raw, value)
         p = self._mixture()
-        return mixtures.cdf(p.location, _component_scale(p), value)
+        return mixtures.cdf(p.location, p.spread, value)
 
     def normal_score(self, value: Tensor) -> Tensor:
         """Φ⁻¹ of :meth:`cdf`, exact far out in both tails: (y − mean) / std for a Gaussian."""
         self._need_spread()
         p = self._mixture()
-        return mixtures.normal_score(p.location, _component_scale(p), self._expand(value))
+        return mixtures.normal_score(p.location, p.spread, self._expand(value))
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log marginal density of every coordinate at ``value``."""
         self._need_spread()
         p = self._mixture()
-        scale = _component_scale(p)
+        scale = p.spread
         if scale is None:
             raise NoDensityError("this prediction is a set of draws without noise: no density")
         return mixtures.log_density(p.location, scale, self._expand(value))
@@ -293,15 +300,9 @@ class Prediction:
         like = p.location
         shape = (count, *self.shape)
         pick = torch.randint(like.shape[0], shape, generator=generator, device=like.device)
-        scale = _component_scale(p)
+        scale = p.spread
         noise = None if scale is None else scale.expand_as(like).gather(0, pick)
         return _with_noise(like.gather(0, pick), noise, generator)
-
-
-def _component_scale(p: Predictive) -> Tensor | None:
-    """Standard deviation of every component; None for draws without noise."""
-    parts = [part.square() for part in (p.noise, p.epistemic) if part is not None]
-    return sum(parts[1:], parts[0]).sqrt() if parts else None
 
 
 def _picks(count: int, paths: Tensor, generator: torch.Generator) -> Tensor:

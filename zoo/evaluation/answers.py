@@ -57,12 +57,12 @@ class Answer:
         like = prediction.predictive.location
         known = ~truth.isnan() if mask is None else mask.bool() & ~truth.isnan()
         if prediction.lengths is not None:
-            known = known & _inside(prediction)
+            known = known & _inside(prediction).to(known.device)
         if not bool(known.any()):
             raise ValueError(f"no entry of the {prediction.task} prediction has a known truth")
         return cls(
             prediction=prediction,
-            truth=torch.where(known, truth, 0).to(like),
+            truth=torch.where(known, truth, 0).double().to(like.device),
             mask=known.to(like.device),
             cluster=clusters(groups, prediction.shape[0], by).to(like.device),
         )
@@ -77,7 +77,8 @@ def _inside(prediction: Prediction) -> Bool[Tensor, "sequence time 1"]:
     lengths = prediction.lengths
     if lengths is None or "time" not in prediction.axes:
         raise ValueError("only predictions in time have lengths")
-    return (torch.arange(prediction.shape[1]) < lengths[:, None].cpu())[..., None]
+    inside = torch.arange(prediction.shape[1], device=lengths.device) < lengths[:, None]
+    return inside[..., None]
 
 
 def clusters(groups: Groups | None, count: int, by: str | None = None) -> Int[Tensor, " sequence"]:
@@ -123,7 +124,7 @@ def estimate(
     """
     total = sums.sum(0)
     value = float(statistic(total))
-    if not math.isfinite(value):
+    if math.isnan(value):
         return None
     left_out = statistic(total - sums)
     left_out = left_out[left_out.isfinite()]

@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 _LEVELS = torch.arange(1, 100, dtype=torch.float64) / 100
+_NODES = 33
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +138,7 @@ class Conformal:
 
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Each draw moved to the corrected quantile of its own raw level."""
-        score = raw.normal_score(draws).double()
+        score = _scores_of_draws(raw, draws).double()
         threshold = (self.thresholds(score.abs()) * score.sign()).to(draws)
         return raw.mean + threshold * self._spread(raw)
 
@@ -203,13 +204,9 @@ class Isotonic:
 
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Each draw moved to the corrected quantile of its own raw level."""
-        grid = torch.linspace(-4, 4, 33, dtype=torch.float64)
-        knots = torch.stack([raw.quantile_at(float(s)) for s in self.levels(grid)])
-        place = (raw.normal_score(draws) - grid[0].item()) * 4
-        below = place.floor().clamp(0, len(grid) - 2)
-        low = knots.gather(0, below.long())
-        high = knots.gather(0, below.long() + 1)
-        return self.scale.transport(raw, torch.lerp(low, high, place - below))
+        score = self.levels(_scores_of_draws(raw, draws).double()).to(draws)
+        knots = torch.stack([raw.quantile_at(s / 2) for s in range(-8, 9)])
+        return self.scale.transport(raw, _read(knots, 2 * score + 8))
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
@@ -255,8 +252,8 @@ def recalibrate(
     ...     axes=("item", "target"), names=("f_z",), units=("N",), task="regress")
     >>> truth = 3 * torch.randn(400, 1, generator=torch.Generator().manual_seed(0))
     >>> mended = raw.recalibrated(recalibrate("scale", raw, truth))
-    >>> round(float(mended.std[0, 0]), 1)
-    3.0
+    >>> bool(2.7 < mended.std[0, 0] < 3.3)
+    True
     """
     answer = Answer.of(prediction.raw, truth, mask, groups)
     if answer.groups < 2:
@@ -284,6 +281,23 @@ def _stretched(p: Predictive, factor: Tensor) -> Predictive:
         epistemic=None if p.epistemic is None else p.epistemic * factor,
         draws=None if p.draws is None else mean + factor * (p.draws - mean),
     )
+
+
+def _scores_of_draws(raw: Prediction, draws: Tensor) -> Tensor:
+    """Normal scores of many draws; of a mixture, read off 33 nodes between its extreme draws."""
+    if raw.predictive.location.shape[0] == 1 or len(draws) <= _NODES:
+        return raw.normal_score(draws)
+    low, high = draws.amin(0), draws.amax(0)
+    share = torch.linspace(0, 1, _NODES).to(draws).view(-1, *[1] * low.ndim)
+    nodes = raw.normal_score(torch.lerp(low, high, share))
+    return _read(nodes, (draws - low) / (high - low).clamp(min=1e-30) * (_NODES - 1))
+
+
+def _read(table: Tensor, place: Tensor) -> Tensor:
+    """Heights of a table along its first axis at fractional rows; end pieces are continued."""
+    below = place.floor().clamp(0, len(table) - 2)
+    low, high = table.gather(0, below.long()), table.gather(0, below.long() + 1)
+    return torch.lerp(low, high, place - below)
 
 
 def _score(levels: Tensor) -> Tensor:
