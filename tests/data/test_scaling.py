@@ -1,0 +1,86 @@
+"""Scaling: moments of the observed entries, the way back, and what does not vary."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.scaling import Kind, Scaler
+
+KINDS: tuple[Kind, ...] = ("standard", "center", "range", "none")
+
+
+def ragged(seed: int = 0, holes: float = 0.2) -> Sequences:
+    """Three movements of unequal length with missing entries, a constant channel and a control."""
+    rng = np.random.default_rng(seed)
+    arrays = [rng.normal(3, [1.0, 5.0, 0.0], size=(n, 3)) for n in (9, 5, 12)]
+    for array in arrays:
+        array[1:][rng.random((len(array) - 1, 3)) < holes] = np.nan
+    controls = [rng.normal(size=(len(a), 1)) for a in arrays]
+    return Sequences.from_arrays(arrays, rate=10.0, controls=controls, channels=["a", "b", "flat"])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_way_back_gives_the_data(kind: Kind) -> None:
+    data = ragged()
+    scaler = Scaler.fit(data, kind)
+    scaled = scaler.apply(data)
+    back = scaled.values * scaler.channel_scale + scaler.channel_shift
+    torch.testing.assert_close(back[data.mask], data.values[data.mask], rtol=0, atol=1e-12)
+    assert not scaled.values[~data.mask].any()
+
+
+def test_moments_are_those_of_the_observed_entries() -> None:
+    data = ragged()
+    entries = np.concatenate(data.arrays)
+    for kind, expected in (("standard", np.nanstd(entries, 0)), ("center", np.ones(3))):
+        scaler = Scaler.fit(data, kind)  # type: ignore[arg-type]
+        np.testing.assert_allclose(scaler.channel_shift, np.nanmean(entries, 0), rtol=1e-12)
+        np.testing.assert_allclose(scaler.channel_scale[:2], expected[:2], rtol=1e-12)
+
+
+def test_range_has_mean_zero_and_touches_one() -> None:
+    data = ragged()
+    scaled = Scaler.fit(data, "range").apply(data)
+    for channel in range(2):
+        entries = scaled.values[..., channel][scaled.mask[..., channel]]
+        assert abs(float(entries.mean())) < 1e-12
+        assert float(entries.abs().max()) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["standard", "range"])
+def test_a_channel_that_does_not_vary_is_named_and_keeps_its_unit(kind: Kind) -> None:
+    scaler = Scaler.fit(ragged(), kind)
+    assert scaler.constant == ("flat",)
+    assert scaler.channel_scale[2] == 1
+
+
+def test_padding_and_missing_entries_have_no_say() -> None:
+    data = ragged()
+    shorter = Sequences.from_arrays(data.arrays[:2], rate=10.0)
+    one = Scaler.fit(shorter)
+    other = Scaler.fit(Sequences.from_arrays([np.concatenate(data.arrays[:2])], rate=10.0))
+    torch.testing.assert_close(one.channel_scale, other.channel_scale, rtol=1e-12, atol=0)
+
+
+def test_inputs_of_pairs_are_scaled_by_their_own_moments() -> None:
+    rng = np.random.default_rng(0)
+    pairs = Pairs.from_arrays(rng.normal(5, 2, (40, 2)), rng.normal(-1, 3, 40))
+    scaled = Scaler.fit(pairs).apply(pairs)
+    np.testing.assert_allclose(scaled.inputs.mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(scaled.inputs.std(0, unbiased=False), 1, rtol=1e-12)
+    np.testing.assert_allclose(scaled.targets.std(0, unbiased=False), 1, rtol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(KINDS))
+def test_json_round_trip_is_exact(seed: int, kind: Kind) -> None:
+    import json
+
+    scaler = Scaler.fit(ragged(seed), kind)
+    back = Scaler.from_json(json.loads(json.dumps(scaler.to_json())))
+    for name in ("channel_scale", "channel_shift", "input_scale", "input_shift"):
+        assert torch.equal(getattr(back, name), getattr(scaler, name))
+    assert (back.kind, back.constant) == (scaler.kind, scaler.constant)
