@@ -58,6 +58,7 @@ class Amortised(nn.Module):
             widths(config.hidden),
             model.latent_dim,
             activation=config.activation,
+            noise="square",
             floor=config.encoder_floor,
         )
 

@@ -32,6 +32,7 @@ CATALOGUE = Registry(
             inference=Svi(window=1, epochs=500),
             data="sequences",
             dataset="thesis-movements",
+            config={"noise": "constant"},
         ),
         Entry(
             name="vae-dynamics",
@@ -39,7 +40,7 @@ CATALOGUE = Registry(
             thesis="§4.2.1.1, §4.3.1",
             model="zoo.models.vae_dynamics:VAEDynamics",
             guide="zoo.guides.amortised:Amortised",
-            inference=Svi(window=2, epochs=200),
+            inference=Svi(window=2, epochs=100),
             data="sequences",
             dataset="pendulum/images",
         ),

@@ -26,9 +26,9 @@ class Config:
     """Settings of :class:`VAE`.
 
     ``hidden`` are the layers from a frame to the latent space, mirrored in the decoder (() is
-    linear); ``noise`` what σ depends on: the ``state`` z, a ``constant`` of each channel, or one
-    ``shared`` by all; ``noise_floor`` the least σ in scaled units. ``chains`` and
-    ``burn_in`` run the Markov chain that fills missing entries.
+    linear); ``noise`` what σ depends on: the ``state`` z (30), the ``square`` of a map of it, a
+    ``constant`` of each channel, or one ``shared`` by all; ``noise_floor`` the least σ in scaled
+    units. ``chains`` and ``burn_in`` run the Markov chain that fills missing entries.
     """
 
     latent_dim: int = 5
@@ -55,16 +55,18 @@ class VAE(nn.Module):
     z_t ~ N(0, I), x_t ~ N(μ(z_t), σ²(z_t)); q(z_t | x_t) by an encoder — (30)–(32)
 
     Thesis §2.1.5.3 and §4.3.1; Kingma & Welling, *Auto-encoding variational Bayes*, ICLR 2014;
-    Rezende et al., ICML 2014. Both networks d–512–5 have the square as transfer function of their
-    σ output, σ = (Wh + b)² + floor: the thesis says so of the encoder, and we read it as the
-    standard deviation, not the variance. The thesis leaves the activation open: ReLU here.
-    Frames are independent items. Missing entries are left out of the likelihood and are 0 to
-    the encoder; predictions of frames with missing entries come from a Markov chain through
-    encoder and decoder, whose Metropolis step corrects the encoder. Entries that were seen get
-    their reconstruction. The networks are point estimates. It knows nothing of time, so that it
-    gives no forecast, and a frame with nothing seen gets draws of the prior.
+    Rezende et al., ICML 2014. Both networks d–512–5; the encoder's σ = (Wh + b)² + floor, since
+    the thesis gives its σ output the square as transfer function (read as the standard deviation,
+    not the variance); the decoder's log σ² = Wh + b, (30), plus a floor, or constants. The thesis
+    leaves the activation open: ReLU here. Frames are independent items. Missing entries are left
+    out of the likelihood and are 0 to the encoder; predictions of frames with missing entries
+    come from a Markov chain through encoder and decoder, whose Metropolis step corrects the
+    encoder. Entries that were seen get their reconstruction. The networks are point estimates. It
+    knows nothing of time, so that it gives no forecast, and a frame with nothing seen gets draws
+    of the prior.
 
-    Defaults: 5 coordinates, hidden 512, σ(z) state dependent, 20 chains of 20 steps.
+    Defaults: 5 coordinates, hidden 512, σ(z) of the state (the entry takes a constant for each
+    channel, which reconstructs movements far better), 20 chains of 20 steps.
     """
 
     config_class: ClassVar[type] = Config

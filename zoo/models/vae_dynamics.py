@@ -25,8 +25,8 @@ class Config:
     """Settings of :class:`VAEDynamics`.
 
     ``hidden`` are the layers from a frame to the latent space, mirrored in the decoder; ``noise``
-    what σ depends on: the ``state`` z̃, a ``constant`` of each channel, or one ``shared`` by all;
-    ``noise_floor`` the least σ in scaled units.
+    what σ depends on: the ``state`` z̃ (30), the ``square`` of a map of it, a ``constant`` of each
+    channel, or one ``shared`` by all; ``noise_floor`` the least σ in scaled units.
     """
 
     latent_dim: int = 5
@@ -51,16 +51,19 @@ class VAEDynamics(nn.Module):
     by an encoder — (70)(71)
 
     Thesis §4.2.1.1 and §4.3.1; after Watter et al., *Embed to control*, NIPS 2015. Networks as in
-    ``vae``: d–512–5 and back, σ = (Wh + b)² + floor, ReLU. W starts at the identity for z and 0
-    for a. ``a_t`` are the data's controls at the frame they act from; data without controls have
-    none. The model is one of pairs (x_t, x_{t+1}): it has no density for how z̃_{t+1} and z_{t+1}
-    are joined, so that a forecast goes through the frames — decode with noise, encode, step — as
-    the model's own Markov chain p(x_{t+1} | x_t, a_t) says. Each component of a forecast is one
-    such path; the noise drawn on top is independent of the noise that the path went on from. The
-    first frame of a reconstruction has no predecessor and gets the marginal: z from the prior,
-    action 0. Missing entries are left out of the likelihood and are 0 to the encoder; a frame
-    with nothing seen is encoded as the prior. It fills no gaps from both sides (no impute). The
-    networks are point estimates.
+    ``vae``: d–512–5 and back, the encoder's σ = (Wh + b)² + floor, the decoder's log σ² = Wh + b,
+    (30), plus a floor: with the square there, training on the images did not converge. ReLU. W
+    starts at the identity for z and 0 for a. ``a_t`` are the data's controls at the frame they
+    act from; data without controls have none. The model is one of pairs (x_t, x_{t+1}): it has no
+    density for how z̃_{t+1} and z_{t+1} are joined, so that a forecast goes through the frames —
+    decode with noise, encode, step — as the model's own Markov chain p(x_{t+1} | x_t, a_t) says.
+    Each component of a forecast is one such path; the noise drawn on top is independent of the
+    noise that the path went on from. The pixels' noise is independent too, where a disturbance
+    moves them together, so that bands of many steps ahead are too narrow until they are
+    recalibrated. The first frame of a reconstruction has no predecessor and gets the marginal: z
+    from the prior, action 0. Missing entries are left out of the likelihood and are 0 to the
+    encoder; a frame with nothing seen is encoded as the prior. It fills no gaps from both sides
+    (no impute). The networks are point estimates.
 
     Defaults: 5 coordinates, hidden 512, σ(z̃) state dependent, windows of 2 frames.
     """
@@ -148,7 +151,13 @@ class VAEDynamics(nn.Module):
         means, stds = [], []
         for t in range(seen - 1, seen + horizon - 1):
             mean, std = self.decoder(self.step(z, None if actions is None else actions[:, t]))
-            z = self._encode(torch.normal(mean, std), None, posterior).sample()
+            frame = mean + std * torch.randn_like(std)
+            if not bool(frame.isfinite().all()):
+                raise FloatingPointError(
+                    f"the forecast diverges at frame {t + 2 - seen} of {horizon}: the roll-out "
+                    "left what was trained on; try a shorter horizon, longer training or tanh"
+                )
+            z = self._encode(frame, None, posterior).sample()
             means.append(mean)
             stds.append(std)
         return Predictive(location=torch.stack(means, 2), noise=torch.stack(stds, 2), joint=True)

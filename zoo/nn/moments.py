@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 from jaxtyping import Float
@@ -10,38 +12,52 @@ from torch import Tensor, nn
 
 from zoo.nn.mlp import Activation, trunk
 
-__all__ = ["ConstantNoiseHead", "GaussianHead", "GaussianNetwork", "Noise"]
+__all__ = ["ConstantNoiseHead", "GaussianHead", "GaussianNetwork", "Noise", "Transfer"]
 
-Noise = Literal["state", "constant", "shared"]
+Transfer = Literal["square", "exponential"]
+Noise = Literal["state", "square", "constant", "shared"]
+
+_transfers: dict[Transfer, tuple[Callable[[Tensor], Tensor], Callable[[float], float]]] = {
+    "square": (lambda s: s.square(), lambda std: std**0.5),
+    "exponential": (lambda s: (s / 2).exp(), lambda std: 2 * math.log(std)),
+}
 
 
 class GaussianHead(nn.Module):
-    """Mean and standard deviation, the latter with the square as transfer function (§4.3.1).
+    """Mean μ = W_μ h + b_μ and standard deviation of s = W_σ h + b_σ.
 
-    μ = W_μ h + b_μ and σ = (W_σ h + b_σ)² + floor. The bias b_σ starts at √``initial``, so that σ
-    starts near ``initial``.
+    ``transfer="square"`` is σ = s² + floor (§4.3.1), ``"exponential"`` log σ² = s plus the floor
+    (30). W_σ starts at 0 and b_σ so that σ starts at ``initial`` for every input: a square of
+    random weights is far off for some.
 
     >>> import torch
     >>> mean, std = GaussianHead(8, 3)(torch.randn(4, 8))
-    >>> mean.shape, bool((std > 0).all())
-    (torch.Size([4, 3]), True)
+    >>> mean.shape, std.unique()
+    (torch.Size([4, 3]), tensor([1.0010], grad_fn=<Unique2Backward0>))
     """
 
     def __init__(
-        self, inputs: int, outputs: int, *, floor: float = 1e-3, initial: float = 1.0
+        self,
+        inputs: int,
+        outputs: int,
+        *,
+        transfer: Transfer = "square",
+        floor: float = 1e-3,
+        initial: float = 1.0,
     ) -> None:
         """Heads from ``inputs`` features to ``outputs`` coordinates."""
         super().__init__()
-        self.floor = floor
+        self.floor, self.transfer = floor, transfer
         self.mean = nn.Linear(inputs, outputs)
         self.root = nn.Linear(inputs, outputs)
-        nn.init.constant_(self.root.bias, initial**0.5)
+        nn.init.zeros_(self.root.weight)
+        nn.init.constant_(self.root.bias, _transfers[transfer][1](initial))
 
     def forward(
         self, features: Float[Tensor, "*batch feature"]
     ) -> tuple[Float[Tensor, "*batch output"], Float[Tensor, "*batch output"]]:
         """Mean and standard deviation."""
-        std = self.root(features).square() + self.floor
+        std = _transfers[self.transfer][0](self.root(features)) + self.floor
         return self.mean(features), std
 
 
@@ -83,8 +99,9 @@ class ConstantNoiseHead(nn.Module):
 class GaussianNetwork(nn.Module):
     """Hidden layers and a head: p(y | x) = N(y; μ(x), σ²), (30).
 
-    ``noise`` says what σ depends on: the ``state`` x, a ``constant`` of each output, or one
-    constant ``shared`` by all. Without hidden layers μ is linear in x.
+    ``noise`` says what σ depends on: the ``state`` x, with log σ² linear in the features, (30); the
+    ``square`` of a linear map of them, §4.3.1; a ``constant`` of each output; or one constant
+    ``shared`` by all. Without hidden layers μ is linear in x.
 
     >>> import torch
     >>> mean, std = GaussianNetwork(5, (512,), 50, noise="shared")(torch.randn(8, 70, 5))
@@ -107,13 +124,13 @@ class GaussianNetwork(nn.Module):
         super().__init__()
         sizes = [inputs, *hidden]
         self.trunk = trunk(sizes, activation)
-        self.head: nn.Module
-        if noise == "state":
-            self.head = GaussianHead(sizes[-1], outputs, floor=floor, initial=initial)
-        else:
-            self.head = ConstantNoiseHead(
-                sizes[-1], outputs, shared=noise == "shared", floor=floor, initial=initial
-            )
+        heads: dict[Noise, Callable[..., nn.Module]] = {
+            "state": partial(GaussianHead, transfer="exponential"),
+            "square": partial(GaussianHead, transfer="square"),
+            "constant": ConstantNoiseHead,
+            "shared": partial(ConstantNoiseHead, shared=True),
+        }
+        self.head = heads[noise](sizes[-1], outputs, floor=floor, initial=initial)
 
     def forward(
         self, x: Float[Tensor, "*batch input"]
