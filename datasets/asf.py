@@ -59,18 +59,15 @@ def read_asf(path: str | Path) -> Skeleton:
 def _sections(path: str | Path) -> list[Section]:
     sections: list[Section] = []
     for number, words in worded_lines(path):
+        keyword = words[0][1:].lower()
         if words[0].startswith(":"):
-            sections.append(
-                Section(keyword=words[0][1:].lower(), line=number, words=words[1:], body=[])
-            )
+            if any(s.keyword == keyword for s in sections):
+                raise FileFormatError(path, number, f"section :{keyword} comes twice")
+            sections.append(Section(keyword=keyword, line=number, words=words[1:], body=[]))
         elif not sections:
             raise FileFormatError(path, number, f"{words[0]!r} before the first :section")
         else:
             sections[-1].body.append((number, words))
-    names = [s.keyword for s in sections]
-    for section in sections:
-        if names.count(section.keyword) > 1:
-            raise FileFormatError(path, section.line, f"section :{section.keyword} comes twice")
     return sections
 
 
