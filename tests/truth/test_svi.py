@@ -238,11 +238,11 @@ def test_gives_up_with_advice() -> None:
         fit_svi(model, lg.Recognition(), lg.frames(), QUICK)
 
 
-def test_broken_gradient_is_named() -> None:
+@pytest.mark.parametrize("value", [torch.inf, torch.nan])
+def test_broken_gradient_is_named(value: float) -> None:
     class Kinked(type(lg.Recognition())):  # type: ignore[misc]
         def forward(self, batch: Batch) -> None:
-            torch.sqrt(0.0 * self.log_scale).sum()
-            self.log_scale.register_hook(lambda g: g * torch.inf)
+            self.log_scale.register_hook(lambda g: g * value)
             super().forward(batch)
 
     with (
@@ -251,6 +251,16 @@ def test_broken_gradient_is_named() -> None:
     ):
         warnings.simplefilter("ignore", TrainingWarning)
         fit_svi(lg.Factors(), Kinked(), lg.frames(), QUICK)
+
+
+def test_clipping_bounds_the_step_and_reports_the_unclipped_norm() -> None:
+    strategy = Svi(epochs=1, batch_size=100, clip=1e-3, schedule="constant")
+    model, guide = fresh()
+    history = fit_svi(model, guide, lg.frames(), strategy)
+    gradients = [p.grad for m in (model, guide) for p in m.parameters()]
+    norm = torch.linalg.vector_norm(torch.stack([g.norm() for g in gradients]))
+    torch.testing.assert_close(norm, torch.tensor(1e-3))
+    assert history.rows[0]["grad_norm"] > 1e-2
 
 
 def test_early_stopping_restores_the_best_state() -> None:
@@ -299,6 +309,14 @@ def test_tensorboard_is_an_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ImportError, match=r"movezoo\[train\]"):
         fit_svi(*fresh(), lg.frames(), QUICK, folder=tmp_path, tensorboard=True)
+
+
+def test_tensorboard_holds_every_epoch(tmp_path: Path) -> None:
+    loading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    history = fit_svi(*fresh(), lg.frames(), QUICK, folder=tmp_path, tensorboard=True)
+    events = loading.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    written = [event.value for event in events.Scalars("kl")]
+    assert written == pytest.approx(history.column("kl"), rel=1e-6)
 
 
 def test_progress_bar_shows_both_terms(capsys: pytest.CaptureFixture[str]) -> None:

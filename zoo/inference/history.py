@@ -63,10 +63,14 @@ class Log:
         if tensorboard and folder is None:
             raise ValueError("tensorboard needs a run folder to write to")
         self._path = None if folder is None else folder / "history.jsonl"
-        self._board = _board(folder / "tensorboard") if tensorboard and folder else None
+        self._events = folder / "tensorboard" if tensorboard and folder else None
+        self._board: Any = None
 
     def start(self, history: History) -> None:
-        """Make the file hold exactly the rows of ``history``."""
+        """Make the log hold exactly the rows of ``history``."""
+        self._close()
+        if self._events is not None:
+            self._board = _board(self._events, len(history))
         if self._path is not None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_file(self._path, "".join(map(_line, history)).encode())
@@ -90,6 +94,9 @@ class Log:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._close()
+
+    def _close(self) -> None:
         if self._board is not None:
             self._board.close()
 
@@ -98,9 +105,10 @@ def _line(row: Row) -> str:
     return json.dumps(row, allow_nan=False) + "\n"
 
 
-def _board(folder: Path) -> Any:
+def _board(folder: Path, epoch: int) -> Any:
+    """A writer whose earlier events from ``epoch`` on are void."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         raise ImportError("tensorboard is missing; pip install 'movezoo[train]'") from None
-    return SummaryWriter(str(folder))
+    return SummaryWriter(str(folder), purge_step=epoch)

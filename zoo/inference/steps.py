@@ -55,11 +55,13 @@ class Steps:
             parameter.grad = None
         terms = tight_bound(self.model, self.guide, batch, c=c, beta=beta)
         (terms.loss / batch.total).backward()
-        norm = self._clip()
+        gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
         parts = (terms.loss.detach(), terms.reconstruction, terms.kl, norm)
         *sums, length = torch.stack(parts).tolist()
         if not all(map(math.isfinite, (*sums, length))):
             raise NotFiniteError(self._blame(terms))
+        self._clip(gradients, length)
         self.optimizer.param_groups[0]["lr"] = self.rate(place.step, tries)
         self.optimizer.step()
         share = len(batch) / batch.total
@@ -94,13 +96,9 @@ class Steps:
         if self.device.type == "cuda":
             torch.cuda.manual_seed(seed)
 
-    def _clip(self) -> Tensor:
-        gradients = [p.grad for p in self.parameters.values() if p.grad is not None]
-        norm: Tensor = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-        if self.strategy.clip is not None:
-            shrink = torch.clamp(self.strategy.clip / norm, max=1.0)
-            torch._foreach_mul_(gradients, shrink)
-        return norm
+    def _clip(self, gradients: list[Tensor], length: float) -> None:
+        if self.strategy.clip is not None and length > self.strategy.clip:
+            torch._foreach_mul_(gradients, self.strategy.clip / length)
 
     def _blame(self, terms: Bound) -> str:
         if broken := terms.broken():
