@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from zoo.registry import Entry, Registry
 from zoo.strategies import Exact, MarginalLikelihood, Svi
 
@@ -61,7 +63,7 @@ CATALOGUE = Registry(
             thesis="§6.3.1.1",
             model="zoo.models.vae_dmp:VaeDmp",
             guide="zoo.guides.filtering:FilteringGuide",
-            inference=_VAE_DMP,
+            inference=replace(_VAE_DMP, epochs=4000, batch_size=32, temper_epochs=400),
             data="sequences",
             dataset="thesis-movements",
             scaling="center",

@@ -123,7 +123,8 @@ class Conditioned:
         centre = means.gather(-3, index).squeeze(-3)
         white = torch.randn(*picks.shape, time * latent, dtype=self.covariance.dtype)
         moved = white.movedim(0, -2) @ _cholesky(self.covariance).mT
-        return centre + moved.movedim(-2, 0).unflatten(-1, (time, latent))
+        path: Tensor = centre + moved.movedim(-2, 0).unflatten(-1, (time, latent))
+        return path
 
     def log_density(
         self, path: Float[Tensor, "*batch time latent"], observation: Float[Tensor, "latent latent"]

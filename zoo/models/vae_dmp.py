@@ -171,7 +171,8 @@ class VaeDmp(LatentDmp):
         path = self.path(
             first, flat["velocity"], flat["w"], flat["goal"], flat["epsilon"], batch.repeat(draws)
         )
-        return path.unflatten(0, (draws, len(batch)))
+        split: Tensor = path.unflatten(0, (draws, len(batch)))
+        return split
 
     def _posterior_paths(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
         if batch.values.shape[1] != self.frames:
