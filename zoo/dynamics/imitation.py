@@ -108,14 +108,23 @@ def fit_matrix(
 
 
 def trajectory_matrix(
-    response: Response, basis: Float[Tensor, "time_minus_1 kernel"]
+    response: Response,
+    basis: Float[Tensor, "time_minus_1 kernel"],
+    *,
+    weight: Float[Tensor, " time_minus_1"] | None = None,
+    begin: bool = True,
 ) -> Float[Tensor, "time parameter"]:
-    """R with y = R (y₁, ẏ₁, g, w₁ … w_N): the whole roll-out as one matrix."""
+    """R with y = R (y₁, ẏ₁, g, w₁ … w_N): the whole roll-out as one matrix.
+
+    ``weight`` is the share η of goal and weights at every step (89); without ``begin`` the first
+    state does not count.
+    """
     start = basis.new_zeros(2, 3 + basis.shape[1])
-    start[0, 0] = start[1, 1] = 1
+    start[0, 0] = start[1, 1] = float(begin)
     goal = basis.new_full((len(basis), 1), response.system.stiffness)
     force = torch.cat([basis.new_zeros(len(basis), 2), goal, basis], dim=1)
-    return response.product(start, force)[0]
+    share = 1.0 if weight is None else weight[:, None]
+    return response.product(start, force * share)[0]
 
 
 def stationary_variance(system: Transformation) -> float:

@@ -1,0 +1,80 @@
+"""Gaussian paths of single movements, gathered into a mixture with equal weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = ["Components", "Paths", "resample"]
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Mean and variance of the path at every time, with joint draws."""
+
+    mean: Float[Tensor, "sequence time channel"]
+    variance: Float[Tensor, "sequence time channel"]
+    draws: Float[Tensor, "sample sequence time channel"]
+
+
+@dataclass(frozen=True)
+class Components:
+    """Moments of every component and draws of the mixture: draw j is of component j mod count."""
+
+    mean: Float[Tensor, "component sequence time channel"]
+    variance: Float[Tensor, "component sequence time channel"]
+    draws: Float[Tensor, "sample sequence time channel"]
+
+    @classmethod
+    def empty(
+        cls, count: int, draws: int, like: Float[Tensor, "sequence time channel"]
+    ) -> Components:
+        """Room for ``count`` components of movements shaped ``like``."""
+        mean = like.new_zeros(count, *like.shape)
+        return cls(mean, torch.zeros_like(mean), like.new_zeros(draws, *like.shape))
+
+    @classmethod
+    def of(cls, parts: list[Paths]) -> Components:
+        """One component, the movements of ``parts`` one after the other."""
+        return cls(
+            torch.cat([p.mean for p in parts])[None],
+            torch.cat([p.variance for p in parts])[None],
+            torch.cat([p.draws for p in parts], dim=1),
+        )
+
+    def put(
+        self,
+        rows: Int[Tensor, " some"],
+        chosen: Bool[Tensor, "component some"],
+        paths: Paths,
+    ) -> None:
+        """Fill in ``paths`` of the movements ``rows`` where they are the component chosen."""
+        count = len(chosen)
+        for component, here in enumerate(chosen):
+            self.mean[component, rows[here]] = paths.mean[here]
+            self.variance[component, rows[here]] = paths.variance[here]
+            self.draws[component::count, rows[here]] = paths.draws[component::count, here]
+
+    def after(self, frames: int) -> Components:
+        """Without the first ``frames`` frames."""
+        mean, variance = self.mean[:, :, frames:], self.variance[:, :, frames:]
+        return Components(mean, variance, self.draws[:, :, frames:])
+
+
+def resample(
+    log_weight: Float[Tensor, "hypothesis sequence"], count: int
+) -> Int[Tensor, "count sequence"]:
+    """Indices of ``count`` equally weighted hypotheses; the likeliest one alone if ``count`` is 1.
+
+    >>> resample(torch.tensor([[0.0], [0.0], [-50.0]]), 4).flatten().tolist()
+    [0, 0, 1, 1]
+    """
+    if count == 1:
+        return log_weight.argmax(0, keepdim=True)
+    below = log_weight.softmax(0).cumsum(0).T.contiguous()
+    points = (torch.arange(count, dtype=below.dtype, device=below.device) + 0.5) / count
+    found = torch.searchsorted(below, points.expand(len(below), -1).contiguous())
+    return found.clamp(max=len(log_weight) - 1).T

@@ -1,0 +1,158 @@
+r"""Gaussian over the parameters of movements: shared factors and independent channels.
+
+A movement i has one parameter vector θ_ic for every channel c::
+
+    a_i ~ N(0, I_r),   δ_ic ~ N(0, V_c V_cᵀ),   θ_ic = μ_c + L_c a_i + δ_ic
+
+The factors a carry what channels have in common, δ what each has alone. Seen data enter as a
+Gaussian likelihood with precision A_c and linear term b_c of every channel; the posterior is of
+the same form, exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["Population", "estimate"]
+
+
+@dataclass(frozen=True)
+class Population:
+    """μ, L and V; ``mean`` may have a leading ``sequence`` axis, and so may the others."""
+
+    mean: Float[Tensor, "*sequence channel parameter"]
+    factors: Float[Tensor, "*sequence channel parameter factor"]
+    private: Float[Tensor, "*sequence channel parameter parameter"]
+
+    def condition(
+        self,
+        precision: Float[Tensor, "channel parameter parameter"],
+        linear: Float[Tensor, "sequence channel parameter"],
+    ) -> Population:
+        """Posterior given likelihoods exp(−½ θᵀAθ + bᵀθ) of every channel."""
+        solved = _solve(self, precision, linear)
+        shared = _times(solved.keep @ self.factors, solved.shared_mean[..., None, :])
+        mean = self.mean + _times(solved.gain, solved.error) + shared
+        root = torch.linalg.solve_triangular(solved.shared_root, solved.eye, upper=False).mT
+        return Population(mean, solved.keep @ self.factors @ root, solved.private)
+
+    def log_evidence(
+        self,
+        precision: Float[Tensor, "channel parameter parameter"],
+        linear: Float[Tensor, "sequence channel parameter"],
+    ) -> Float[Tensor, " sequence"]:
+        """Log of the likelihood, integrated over θ, up to terms free of this population."""
+        solved = _solve(self, precision, linear)
+        at_mean = (self.mean * (linear + solved.error)).sum((-1, -2)) / 2
+        private = (solved.error * _times(solved.gain, solved.error)).sum((-1, -2)) / 2
+        shared = (solved.shared_linear * solved.shared_mean).sum(-1) / 2
+        return at_mean + private + shared - solved.log_volume
+
+    def affine(
+        self, scale: Float[Tensor, "*sequence channel parameter"], shift: Tensor
+    ) -> Population:
+        """The population of scale ⊙ θ + shift."""
+        wide = scale[..., None]
+        return Population(self.mean * scale + shift, self.factors * wide, self.private * wide)
+
+    def moments(
+        self, design: Float[Tensor, "*channel time parameter"]
+    ) -> tuple[Float[Tensor, "sequence time channel"], Float[Tensor, "sequence time channel"]]:
+        """Mean and variance of design θ_c at every time."""
+        spread = [(design @ part).square().sum(-1) for part in (self.factors, self.private)]
+        mean = _times(design, self.mean)
+        return mean.mT, (spread[0] + spread[1]).expand_as(mean).mT
+
+    def sample(self, count: int) -> Float[Tensor, "sample sequence channel parameter"]:
+        """Joint draws of θ, from torch's default generator."""
+        *_, parameters, rank = self.factors.shape
+        rows, channels = self.mean.shape[:-2], self.mean.shape[-2]
+        a = torch.randn(count, *rows, 1, rank, dtype=self.mean.dtype, device=self.mean.device)
+        white = torch.randn(
+            count, *rows, channels, parameters, dtype=self.mean.dtype, device=self.mean.device
+        )
+        return self.mean + _times(self.factors, a) + _times(self.private, white)
+
+
+def estimate(
+    parameters: Float[Tensor, "sequence channel parameter"],
+    uncertainty: Float[Tensor, "channel parameter parameter"],
+    shrinkage: float,
+    floor: Float[Tensor, " parameter"],
+) -> Population:
+    """Population of several movements, its covariance shrunk towards independent channels.
+
+    The sample covariance over movements, of rank one less than their number, keeps the share
+    1 − ``shrinkage``; the rest goes to every channel alone, with a shape pooled over channels and
+    each channel's own size. ``uncertainty`` of the single estimates and the variance ``floor`` are
+    added to every channel. A new movement is 1 + 1/count times as far from the estimated mean.
+    """
+    count, channels, _ = parameters.shape
+    mean = parameters.mean(0)
+    private = uncertainty + torch.diag(floor)
+    if count == 1:
+        return Population(mean, mean.new_zeros(*mean.shape, 0), _root(private))
+    inflation = (1 + 1 / count) / (count - 1)
+    deviation = (parameters - mean) * inflation**0.5
+    size = deviation.square().sum((0, 2)).clamp_min(torch.finfo(mean.dtype).tiny)
+    scaled = deviation / size.sqrt()[:, None]
+    shape = torch.einsum("scp,scq->pq", scaled, scaled) / channels
+    private = private + shrinkage * size[:, None, None] * shape
+    factors = (1 - shrinkage) ** 0.5 * deviation.permute(1, 2, 0)
+    return Population(mean, factors, _root(private))
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Quantities that posterior and evidence share."""
+
+    error: Tensor
+    gain: Tensor
+    keep: Tensor
+    private: Tensor
+    shared_root: Tensor
+    shared_linear: Tensor
+    shared_mean: Tensor
+    log_volume: Tensor
+    eye: Tensor
+
+
+def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
+    v, factors = prior.private, prior.factors
+    eye = torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
+    root = torch.linalg.cholesky(eye + v.mT @ precision @ v)
+    private = torch.linalg.solve_triangular(root, v.mT, upper=False).mT
+    gain = private @ private.mT
+    keep = eye - gain @ precision
+    error = linear - _times(precision, prior.mean)
+    shared_eye = torch.eye(factors.shape[-1], dtype=v.dtype, device=v.device)
+    shared = shared_eye + (factors.mT @ precision @ keep @ factors).sum(-3)
+    shared_root = torch.linalg.cholesky((shared + shared.mT) / 2)
+    shared_linear = torch.einsum("...cpr,...cp->...r", keep @ factors, error)
+    log_volume = root.diagonal(dim1=-2, dim2=-1).log().sum((-1, -2))
+    return _Solved(
+        error=error,
+        gain=gain,
+        keep=keep,
+        private=private,
+        shared_root=shared_root,
+        shared_linear=shared_linear,
+        shared_mean=torch.cholesky_solve(shared_linear[..., None], shared_root)[..., 0],
+        log_volume=log_volume + shared_root.diagonal(dim1=-2, dim2=-1).log().sum(-1),
+        eye=shared_eye,
+    )
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    product: Tensor = matrix @ vector[..., None]
+    return product[..., 0]
+
+
+def _root(covariance: Float[Tensor, "*c p p"]) -> Float[Tensor, "*c p p"]:
+    values, vectors = torch.linalg.eigh(covariance)
+    root: Tensor = vectors * values.clamp_min(0).sqrt()[..., None, :]
+    return root

@@ -1,0 +1,396 @@
+"""Dynamic movement primitives with uncertainty: `dmp`, `dmp-rhythmic`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from zoo.datasets.records import Sequences
+from zoo.dynamics.components import Components, Paths, resample
+from zoo.dynamics.dmp import Response
+from zoo.dynamics.imitation import trajectory_matrix
+from zoo.dynamics.learning import learn, phases
+from zoo.dynamics.population import Population
+from zoo.dynamics.rollout import Primitive, Sight, Timing, path_noise, roll_out, sight
+from zoo.errors import NotFittedError
+from zoo.prediction import Predictive
+from zoo.types import Batch, Layout, Posterior
+
+__all__ = ["DMP", "Config"]
+
+COMPONENTS = 16
+
+
+@dataclass(frozen=True)
+class Case:
+    """Movements with the same entries seen and one timing: p(θ | x) of each."""
+
+    population: Population
+    view: Sight
+    timing: Timing
+    x: Float[Tensor, "sequence time channel"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Settings of :class:`DMP`; times are in units of the movement's duration or period.
+
+    ``learning`` is ``bayes``, the conjugate posterior, or ``lwr``, locally weighted regression
+    (61). ``beta`` None is α/4, critical damping. ``gated`` multiplies the forcing term by the
+    phase s. ``period`` of rhythmic movements is in s; None finds it by autocorrelation.
+    ``goal_scaling`` scales the forcing term by (g − y₁) when the goal is changed; joints whose
+    fitted |g − y₁| is below ``least_amplitude`` (scaled units) are scaled less.
+    """
+
+    kind: Literal["discrete", "rhythmic"] = "discrete"
+    learning: Literal["bayes", "lwr"] = "bayes"
+    kernels: int = 20
+    alpha: float = 25.0
+    beta: float | None = None
+    gated: bool = False
+    period: float | None = None
+    goal_scaling: bool = True
+    least_amplitude: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse settings that give no attractor or no basis."""
+        if self.kernels < 2:
+            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
+        for name in ("alpha", "beta", "period", "least_amplitude"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive; got {value}")
+        if self.gated and self.kind == "rhythmic":
+            raise ValueError("gated needs a phase that ends; a rhythmic movement has none")
+
+
+class DMP(nn.Module):
+    r"""A spring to a goal driven by a learned forcing term, as a linear-Gaussian model of movement.
+
+    For every joint::
+
+        τ² ÿ = α (β (g − y) − τ ẏ) + Ψ(s)w + σ_f ε,   x_t ~ N(y_t, σ² ρ),   ε ~ N(0, 1)
+
+    so that f_target ~ N(Ψ(s)w, σ_f²), (59). θ = (y₁, ẏ₁, g, w) is Gaussian over movements,
+    with factors that joints share and a part of each joint alone (a covariance over movements that
+    is shrunk; the share is chosen by the density of movements left out). As positions are linear in
+    θ and ε, forecasts, filled gaps, other goals, durations and switching (89) are exact Gaussians.
+    A forecast conditions weights, goal and first state on the frames seen; where training movements
+    differ in duration, or in phase for ``rhythmic``, it is a mixture over these.
+
+    Thesis §2.2.1, (53)–(62), §6.2.4, §6.2.5; Ijspeert et al., *Dynamical movement primitives*,
+    Neural Computation 25 (2013); population of weights as in Paraschos et al., *Probabilistic
+    movement primitives*, NIPS 2013. Defaults: 20 kernels (§5.3.2), α = 25, β = α/4, forcing term
+    without gate as (54) has it, Ijspeert's widths. Noise and prior variances by evidence
+    maximisation. ``epistemic`` is the spread of the path y: of θ and of the forces ε; ``noise`` is
+    that of the observation. With a single training movement, spread over movements is unknown: its
+    first state and goal get the spread over time. Variances are point estimates.
+    """
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float64
+
+    mean: Tensor
+    factors: Tensor
+    private: Tensor
+    noise: Tensor
+    ratio: Tensor
+    shrinkage: Tensor
+    units: Tensor
+    offsets: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """A model without data: θ ~ N(0, I)."""
+        super().__init__()
+        self.layout, self.config = layout, config
+        beta = config.alpha / 4 if config.beta is None else config.beta
+        self.primitive = Primitive(config.kind, config.kernels, config.alpha, beta, config.gated)
+        channels, parameters = len(layout.channels), config.kernels + 3
+        eye = torch.eye(parameters, dtype=self.dtype)
+        self._keep("mean", torch.zeros(channels, parameters))
+        self._keep("factors", torch.zeros(channels, parameters, 0))
+        self._keep("private", eye.repeat(channels, 1, 1))
+        self._keep("noise", torch.ones(channels))
+        self._keep("ratio", torch.full((channels,), 1e-2))
+        for name in ("shrinkage", "units", "offsets"):
+            self._keep(name, torch.empty(0))
+
+    @property
+    def population(self) -> Population:
+        """p(θ) of a new movement."""
+        return Population(self.mean, self.factors, self.private)
+
+    def condition(self, data: Sequences) -> None:
+        """Learn p(θ), the noise, and the durations or the period of the movements."""
+        period = None if self.config.period is None else self.config.period * data.rate
+        found = learn(
+            self.primitive, self.config.learning, period, data.values, data.mask, data.lengths
+        )
+        timings = _hypotheses(self.config.kind, found.timings)
+        self._keep("mean", found.population.mean)
+        self._keep("factors", found.population.factors)
+        self._keep("private", found.population.private)
+        self._keep("noise", found.noise.sqrt())
+        self._keep("ratio", found.ratio)
+        self._keep("shrinkage", self.mean.new_tensor(found.shrinkage))
+        self._keep("units", self.mean.new_tensor([t.unit for t in timings]))
+        self._keep("offsets", self.mean.new_tensor([t.offset for t in timings]))
+
+    def forward(self, batch: Batch) -> Float[Tensor, "sequence frame channel"]:
+        """The generative program of the whole movements of ``batch``."""
+        frames, channels = batch.movements.shape[1:]
+        timing = self._whole(frames)[0]
+        rows = torch.arange(len(batch.movements))
+        with pyro.plate("movements", size=batch.total_sequences, subsample=rows):
+            a = self._white("shared", self.factors.shape[-1])
+            δ = self._white("private", channels, self.primitive.kernels + 3)
+            ε = self._white("force", frames - 1, channels)
+            shared = torch.einsum("cpr,sr->scp", self.factors, a)
+            θ = self.mean + shared + torch.einsum("cpq,scq->scp", self.private, δ)
+            path = θ @ roll_out(self.primitive, frames, timing).mT
+            y = path.mT + self.noise * (path_noise(self.primitive, frames, timing) @ ε)
+            noise = dist.Normal(y, self.noise * self.ratio.sqrt())
+            if batch.movement_mask is not None:
+                noise = noise.mask(batch.movement_mask)
+            pyro.sample("x", noise.to_event(2), obs=batch.movements)
+        return y
+
+    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Fresh roll-outs of the weights, goal and first state that the movements have."""
+        frames = batch.values.shape[1]
+        timings, blank = self._whole(frames), torch.zeros_like(_seen(batch)[0])
+
+        def render(case: Case) -> Paths:
+            view = self._sight(blank, case.timing)
+            return self._paths([(view.design, case.population)], view, case.x, draws)
+
+        parts = self._mixture(batch.values, _seen(batch), timings, 1, render, draws)
+        return self._as_predictive(parts)
+
+    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """The paths given the entries seen."""
+        timings = self._whole(batch.values.shape[1])
+        count = 1 if len(timings) == 1 else COMPONENTS
+        return self._as_predictive(self._filled(batch.values, _seen(batch), timings, count, draws))
+
+    def forecast(
+        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
+    ) -> Predictive:
+        """The paths given their first frames, after these."""
+        self._check_fitted()
+        pad = (0, 0, 0, horizon)
+        values, seen = functional.pad(batch.values, pad), functional.pad(_seen(batch), pad)
+        known = batch.values.shape[1]
+        count = 1 if len(self.units) == 1 else COMPONENTS
+        parts = self._filled(values, seen, self._timings(known), count, draws)
+        return self._as_predictive(parts.after(known))
+
+    def generate(
+        self,
+        batch: Batch,
+        posterior: Posterior | None,
+        *,
+        goal: Float[Tensor, "sequence channel"] | None,
+        duration: float,
+        onto: Batch | None,
+        start: int,
+        steps: int,
+        draws: int,
+    ) -> Predictive:
+        """Roll-outs of the demonstrated weights, with other goals, durations, or switched (89).
+
+        A switched movement keeps the tempo of ``batch``; ``goal`` is then that of ``onto``. With
+        goal scaling, the forcing term is scaled by (g' − y₁)/(g − y₁).
+        """
+        self._check_fitted()
+        frames = round((batch.values.shape[1] - 1) * duration) + 1
+        other = None if onto is None else self._demonstrated(onto, len(batch))
+        blend = _ramp(frames, start, steps) if other else torch.zeros(frames - 1, dtype=self.dtype)
+
+        def mix(i: int, case: Case) -> Paths:
+            timing = Timing(case.timing.unit * duration, case.timing.offset)
+            view = self._sight(torch.zeros(frames, len(self.noise), dtype=torch.bool), timing)
+            terms = [(self._part(frames, timing, 1 - blend, begin=True), case.population)]
+            if other:
+                phase = Timing(timing.unit, other[i].timing.offset)
+                terms.append((self._part(frames, phase, blend, begin=False), other[i].population))
+            if goal is not None:
+                terms[-1] = (terms[-1][0], self._moved(terms[-1][1], goal[i : i + 1]))
+            still = case.x.new_zeros(1, frames, len(self.noise))
+            return self._paths(terms, view, still, draws)
+
+        parts = [mix(i, case) for i, case in enumerate(self._demonstrated(batch, len(batch)))]
+        return self._as_predictive(Components.of(parts))
+
+    def _filled(
+        self, values: Tensor, seen: Tensor, timings: list[Timing], count: int, draws: int
+    ) -> Components:
+        def render(case: Case) -> Paths:
+            return self._paths([(case.view.design, case.population)], case.view, case.x, draws)
+
+        return self._mixture(values, seen, timings, count, render, draws)
+
+    def _mixture(
+        self,
+        values: Tensor,
+        seen: Tensor,
+        timings: list[Timing],
+        count: int,
+        render: Callable[[Case], Paths],
+        draws: int,
+    ) -> Components:
+        """A mixture over timings, resampled to ``count`` components (1: the likeliest timing)."""
+        self._check_fitted()
+        parts = Components.empty(count, draws, values)
+        for rows, mask in _alike(seen):
+            x = values[rows] * mask
+            views = [self._sight(mask, timing) for timing in timings]
+            picks = resample(torch.stack([self._evidence(view, x) for view in views]), count)
+            for i in picks.unique().tolist():
+                some = (picks == i).any(0)
+                case = self._case(views[i], timings[i], x[some])
+                parts.put(rows[some], picks[:, some] == i, render(case))
+        return parts
+
+    def _case(self, view: Sight, timing: Timing, x: Tensor) -> Case:
+        precision, linear = self._likelihood(view, x)
+        return Case(self.population.condition(precision, linear), view, timing, x)
+
+    def _demonstrated(self, batch: Batch, count: int) -> list[Case]:
+        """The likeliest timing of every movement and its posterior."""
+        if len(batch) not in (1, count):
+            raise ValueError(f"onto has {len(batch)} movements; 1 or {count} are needed")
+        timings, cases = self._whole(batch.values.shape[1]), []
+        for x, mask in zip(batch.values, _seen(batch), strict=True):
+            views = [self._sight(mask, timing) for timing in timings]
+            known = (x * mask)[None]
+            best = int(torch.stack([self._evidence(view, known) for view in views]).argmax())
+            cases.append(self._case(views[best], timings[best], known))
+        return cases if len(cases) == count else cases * count
+
+    def _likelihood(self, view: Sight, x: Tensor) -> tuple[Tensor, Tensor]:
+        linear = (view.project @ x.mT[..., None])[..., 0]
+        variance = self.noise.square()
+        return view.precision / variance[:, None, None], linear / variance[:, None]
+
+    def _evidence(self, view: Sight, x: Tensor) -> Float[Tensor, " sequence"]:
+        """Log density of the frames seen, up to what all timings have in common."""
+        white = (view.whiten @ x.mT[..., None])[..., 0] / self.noise[:, None]
+        volume = view.log_volume.expand_as(self.noise).sum()
+        fit = self.population.log_evidence(*self._likelihood(view, x))
+        return fit - white.square().sum((-1, -2)) / 2 - volume
+
+    def _paths(
+        self, terms: list[tuple[Tensor, Population]], view: Sight, x: Tensor, draws: int
+    ) -> Paths:
+        """Sum of design θ over ``terms``, with the residual of ``view``; draws by Matheron."""
+        residual = (view.follow @ x.mT[..., None])[..., 0].mT
+        moments = [population.moments(design) for design, population in terms]
+        mean = residual + sum(m for m, _ in moments)
+        variance = view.variance.mT * self.noise.square() + sum(v for _, v in moments)
+        shape = (draws, len(x), len(self.noise))
+        ε = torch.randn(*shape, view.noise.shape[1], 1, dtype=x.dtype)
+        η = torch.randn(*shape, view.noise.shape[0], 1, dtype=x.dtype)
+        force = view.noise @ ε
+        force = force - view.follow @ (force + self.ratio.sqrt()[:, None, None] * η)
+        path = residual.mT + self.noise[:, None] * force[..., 0]
+        for design, population in terms:
+            path = path + (design @ population.sample(draws)[..., None])[..., 0]
+        return Paths(mean, variance, path.mT)
+
+    def _part(self, frames: int, timing: Timing, weight: Tensor, *, begin: bool) -> Tensor:
+        """R of a movement whose goal and weights count ``weight`` at every step."""
+        response = Response.of(self.primitive.system(timing), frames)
+        basis = self.primitive.basis(frames, timing)[:-1]
+        return trajectory_matrix(response, basis, weight=weight, begin=begin)
+
+    def _moved(self, population: Population, goal: Float[Tensor, "1 channel"]) -> Population:
+        """The population with another goal, its forcing term scaled along."""
+        fitted = population.mean[..., 2]
+        reach = fitted - population.mean[..., 0]
+        least = self.config.least_amplitude**2
+        κ = 1 + (goal - fitted) * reach / reach.square().clamp_min(least)
+        if self.config.kind == "rhythmic" or not self.config.goal_scaling:
+            κ = torch.ones_like(κ)
+        scale = κ[..., None].repeat(1, 1, population.mean.shape[-1])
+        scale[..., :2], scale[..., 2] = 1, 0
+        shift = torch.zeros_like(scale)
+        shift[..., 2] = goal
+        return population.affine(scale, shift)
+
+    def _sight(self, seen: Tensor, timing: Timing) -> Sight:
+        frames = len(seen)
+        design = roll_out(self.primitive, frames, timing)
+        return sight(design, path_noise(self.primitive, frames, timing), self.ratio, seen)
+
+    def _whole(self, frames: int) -> list[Timing]:
+        """Possible timings of a complete movement of ``frames`` frames."""
+        return [Timing(frames - 1.0)] if self.config.kind == "discrete" else self._timings(frames)
+
+    def _timings(self, frames: int) -> list[Timing]:
+        """Possible timings of a movement whose first ``frames`` frames are known."""
+        pairs = zip(self.units.tolist(), self.offsets.tolist(), strict=True)
+        timings = [Timing(unit, offset) for unit, offset in pairs]
+        going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
+        return going or [max(timings, key=lambda t: t.unit)]
+
+    def _as_predictive(self, parts: Components) -> Predictive:
+        noise = (self.noise * self.ratio.sqrt()).expand_as(parts.mean)
+        return Predictive(
+            location=parts.mean, noise=noise, epistemic=parts.variance.sqrt(), draws=parts.draws
+        )
+
+    def _white(self, name: str, *shape: int) -> Tensor:
+        zero = self.mean.new_zeros(shape)
+        site = dist.Normal(zero, torch.ones_like(zero)).to_event(len(shape))
+        value: Tensor = pyro.sample(name, site)
+        return value
+
+    def _keep(self, name: str, value: Tensor) -> None:
+        self.register_buffer(name, value.detach().to(self.dtype).clone())
+
+    def _check_fitted(self) -> None:
+        if not len(self.units):
+            raise NotFittedError("dmp has not been trained: zoo.fit(model, train) comes first")
+
+
+def _seen(batch: Batch) -> Bool[Tensor, "sequence time channel"]:
+    if batch.mask is None:
+        return torch.ones_like(batch.values, dtype=torch.bool)
+    return batch.mask
+
+
+def _alike(seen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows of the movements that have the same entries, with these."""
+    patterns, index = torch.unique(seen.flatten(1), dim=0, return_inverse=True)
+    for i, pattern in enumerate(patterns):
+        yield (index == i).nonzero()[:, 0], pattern.view(seen.shape[1:])
+
+
+def _hypotheses(kind: str, timings: Sequence[Timing]) -> list[Timing]:
+    """Timings that a new movement may have: durations seen, or all phases of the period."""
+    if kind == "rhythmic":
+        return phases(timings[0].unit)
+    units = sorted({t.unit for t in timings})
+    if len(units) > COMPONENTS:
+        ranks = torch.linspace(0, len(units) - 1, COMPONENTS).round().int().tolist()
+        units = [units[rank] for rank in ranks]
+    return [Timing(unit) for unit in units]
+
+
+def _ramp(frames: int, start: int, steps: int) -> Float[Tensor, " step"]:
+    """Share of the movement switched to: 0 until ``start``, 1 from ``start + steps``."""
+    if start < 0 or steps < 1 or start + steps > frames - 1:
+        raise ValueError(
+            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
+        )
+    time = torch.arange(frames - 1, dtype=torch.float64)
+    return ((time - start) / steps).clamp(0, 1)
