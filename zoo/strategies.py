@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 __all__ = ["Exact", "Inference", "MarginalLikelihood", "Svi"]
@@ -15,6 +16,7 @@ class Svi:
     ``window`` frames a window (None: whole movements), cut every ``stride`` frames;
     ``temper_epochs`` is T_a of (87), 0 for none; ``warmup_epochs`` a second schedule on the KL;
     ``patience`` validations without progress end the training and the best state is restored.
+    ``max_steps`` bounds the work on large data: see :meth:`budgeted`.
     """
 
     epochs: int = 500
@@ -29,6 +31,7 @@ class Svi:
     patience: int | None = 20
     validate_every: int = 10
     checkpoint_every: int = 10
+    max_steps: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse settings that no training could run with."""
@@ -37,6 +40,27 @@ class Svi:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate must be positive; got {self.learning_rate}")
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"max_steps must be at least 1; got {self.max_steps}")
+
+    def budgeted(self, steps_an_epoch: int) -> Svi:
+        """The same schedule, shortened as a whole where it would take more than ``max_steps``.
+
+        >>> shorter = Svi(epochs=1000, temper_epochs=100, max_steps=5000).budgeted(50)
+        >>> shorter.epochs, shorter.temper_epochs
+        (100, 10)
+        """
+        if self.max_steps is None or self.epochs * steps_an_epoch <= self.max_steps:
+            return self
+        epochs = max(1, self.max_steps // steps_an_epoch)
+        share = epochs / self.epochs
+        return replace(
+            self,
+            epochs=epochs,
+            temper_epochs=math.ceil(share * self.temper_epochs),
+            warmup_epochs=math.ceil(share * self.warmup_epochs),
+            validate_every=max(1, math.floor(share * self.validate_every)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -69,7 +69,9 @@ def fit_svi(
         training.keep_in(place, log, checkpoint_seconds)
         training.begin(resume)
         scope.enter_context(pyro.validation_enabled(False))
-        bar = TrainingBar(epochs=strategy.epochs, steps=len(training.loader), shown=progress)
+        bar = TrainingBar(
+            epochs=training.strategy.epochs, steps=len(training.loader), shown=progress
+        )
         training.run(scope.enter_context(bar), on_epoch)
     return training.state.history
 
@@ -85,8 +87,8 @@ class _Training:
         seed: int,
         device: str,
     ) -> None:
-        self.strategy = strategy
         self.loader = _loader(train, strategy, seed, device)
+        self.strategy = strategy = strategy.budgeted(len(self.loader))
         self.val = None if val is None else _loader(val, strategy, seed, device)
         self.steps = Steps(model, guide, self.loader, strategy, seed=seed, device=device)
         self.parts = Parts(model, guide, self.steps.optimizer)
