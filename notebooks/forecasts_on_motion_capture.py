@@ -88,7 +88,7 @@ for name in ("mean", "last-value", "ar", "nearest-neighbour"):
     rival = zoo.fit(zoo.create(name, train), train).calibrate(calib, tasks=["forecast"])
     tables.append(zoo.evaluate(rival, test, tasks=["forecast"]))
 tables.append(zoo.evaluate(run, test, tasks=["forecast"]))
-zoo.Table.stack(tables)
+zoo.Table.join(tables)
 
 # %% [markdown]
 # Read error and coverage together: a small error with a band that misses is worse than a larger

@@ -92,7 +92,7 @@ test = zoo.Pairs.from_arrays(
     channels=["f_z"],
     units="N",
 )
-zoo.Table.stack([zoo.evaluate(run, test) for run in runs.values()])
+zoo.Table.join([zoo.evaluate(run, test) for run in runs.values()])
 
 # %% [markdown]
 # FITC and VFE disagree where inducing inputs are too few: FITC calls what it cannot explain small

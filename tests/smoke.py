@@ -22,7 +22,7 @@ def main() -> None:
             settings = {"epochs": 2} if name == "vae-dmp" else {}
             run = zoo.fit(zoo.create(name, train, **settings), train).calibrate(calib)
             zoo.load(run.save(Path(folder) / name)).reconstruct(calib)
-            print(zoo.evaluate(run, calib[:1]).markdown() if name == "dmp" else name)
+            print(zoo.evaluate(run, calib[:1]).to_markdown() if name == "dmp" else name)
     listing = subprocess.run(
         [sys.executable, "-m", "zoo", "list", "--json"], check=True, capture_output=True, text=True
     )

@@ -74,8 +74,8 @@ def assembly_of(entry: Entry, *, epochs: int = 2, seed: int = 0) -> Assembly:
         settings = {"epochs": epochs, "batch_size": 16, "checkpoint_every": 1}
     elif "iterations" in options(entry):
         settings = {"iterations": 5}
-    if "inducing" in options(entry):
-        settings["inducing"] = 0.8
+    quick = {"inducing": 0.8, "em_tolerance": 1e-5}
+    settings |= {k: v for k, v in quick.items() if k in options(entry)}
     return zoo.create(entry.name, data_of(entry), seed=seed, **settings)
 
 
