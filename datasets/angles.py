@@ -20,11 +20,12 @@ def continuous(
 ) -> tuple[Float[ndarray, "frame channel"], tuple[str, ...]]:
     """The movement without jumps of more than 90° a frame where one can be undone, and what was.
 
-    A joint goes on from its last frame by the first of these that moves it by less than 90°: its
-    angles up to full turns; for three angles the equal ones (x+π, π−y, z+π); for an x–z joint the
-    angle z with its sign restored. CMU's files lose that sign beyond 90°: in 35_14 and 35_19 the
-    thumb and hand, which turn together at a fixed angle of 30°, disagree by it to 0.1°. Channels
-    end in ``_rx``, ``_ry``, ``_rz``; others stay. Angles in rad, frames count from 1.
+    A joint goes on from each frame by the first of these that moves it by less than 90°: its
+    angles up to full turns; of three angles the equal ones (x+π, π−y, z+π); of an x–z joint z with
+    its sign restored. CMU's files lose that sign beyond 90°: in 35_14 and 35_19 the z of thumb and
+    hand, which otherwise differ by 30° to 0.1°, have opposite signs there (beyond 135° it cannot be
+    told from a full turn). Where none does, the angles stay, up to full turns. Channels end in
+    ``_rx``, ``_ry``, ``_rz``; others are left alone. Angles in rad, frames count from 1.
 
     >>> angles = np.deg2rad([[170.0], [-175.0], [-160.0]])
     >>> smooth, notes = continuous(angles, ["root_ry"])
@@ -50,7 +51,7 @@ def _walk(values: Float[ndarray, "frame dof"], repairs: Repairs) -> tuple[ndarra
     for angles in values[1:]:
         options = {n: _nearest(repair(angles), path[-1]) for n, repair in repairs.items()}
         jumps = {n: np.abs(option - path[-1]).max() for n, option in options.items()}
-        name = next((n for n, jump in jumps.items() if jump < JUMP), next(iter(options)))
+        name = next((n for n, jump in jumps.items() if jump < JUMP), next(iter(repairs)))
         path.append(options[name])
         how.append(name if (options[name] != angles).any() else "")
     return np.stack(path), np.array(how)

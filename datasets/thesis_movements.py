@@ -21,9 +21,10 @@ def load(*, folder: str | Path | None = None) -> Sequences:
     """Walking, balance, kicking, tai chi and punching as in Table 2: joint angles in rad.
 
     The data of the VAE-DMP paper as later passed on with VTSFE: CMU motion capture of the subjects
-    of §5.3.1, angles folded to [−π/2, π/2] by arcsin(sin). Every 7th frame of 120 Hz holds for
-    balance, so that ``rate`` is nominal and time counts as normalised. Walking and balance are
-    certain; the names kicking, punching and tai chi are inferred from the limbs that move.
+    of §5.3.1, angles folded by arcsin(sin). Balance is frames 50 + 7i of trial 49_18 at 120 Hz
+    (three angles of its right leg differ by up to 0.032 rad); the other rates are not known, so
+    that ``rate`` is nominal and time counts as normalised. Walking and balance are certain; the
+    names kicking, punching and tai chi are inferred from the limbs that move.
     """
     path = require("movements.npz", dataset="thesis-movements", folder=folder, advice=ADVICE)
     with np.load(path, allow_pickle=False) as archive:
