@@ -64,7 +64,7 @@ def describe(data: Pairs | Sequences) -> dict[str, Any]:
         description |= {
             "movements": len(data),
             "frames": f"{min(lengths)}–{max(lengths)}",
-            "rate": f"{layout.rate:g} Hz",
+            "rate": _rate(data),  # type: ignore[arg-type]
         }
     else:
         description |= {"items": len(data), "features": len(layout.inputs)}
@@ -74,7 +74,13 @@ def describe(data: Pairs | Sequences) -> dict[str, Any]:
         "missing": f"{1 - _present(data):.1%}",
         "groups": {k: _shortened(tuple(dict.fromkeys(v))) for k, v in data.groups.items()},
     }
+    if notes := getattr(data, "notes", ()):
+        description["notes"] = "; ".join(notes)
     return description
+
+
+def _rate(data: Sequences) -> str:
+    return f"{data.rate:.4g} Hz{' in the mean' if data.time_normalised else ''}"
 
 
 def _present(data: Pairs | Sequences) -> float:
