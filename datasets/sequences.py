@@ -35,7 +35,8 @@ class Sequences:
     """Movements of unequal length: values in ``units``, one row of ``groups`` for each movement.
 
     ``values`` is padded to the longest movement; padding and missing entries hold 0 and are False
-    in ``mask``. ``controls`` are known inputs of every frame (actions), with their own names.
+    in ``mask``. ``controls`` are known inputs of every frame (actions), with their own names;
+    they may run on past the last frame where those of a forecast are known.
     ``rate`` is in Hz; where ``time_normalised``, every movement was stretched to one length, and it
     is that of the mean duration. ``provenance`` is ``public``, ``thesis`` or ``simulated``.
     ``notes`` say what a loader changed in the recording.
@@ -121,9 +122,14 @@ class Sequences:
             values=self.values[rows, :end],
             mask=self.mask[rows, :end],
             lengths=lengths,
-            controls=None if self.controls is None else self.controls[rows, :end],
+            controls=None if self.controls is None else self.controls[rows, : end + self._ahead],
             groups={k: tuple(v[i] for i in rows) for k, v in self.groups.items()},
         )
+
+    @property
+    def _ahead(self) -> int:
+        """Frames to come whose controls are known already."""
+        return 0 if self.controls is None else self.controls.shape[1] - self.values.shape[1]
 
     @property
     def layout(self) -> Layout:

@@ -168,3 +168,19 @@ def test_it_learns_the_pendulum_through_the_harness() -> None:
     assert history.rows[-1]["loss"] < history.rows[0]["loss"]
     with pytest.raises(ValueError, match="at least 2 frames; got 1"):
         fit_svi(model, guide, train, Svi(epochs=1, window=1), seed=0)
+
+
+def test_controls_of_the_frames_to_come_reach_the_batch() -> None:
+    data = movements()
+    known = replace(data.first(6), controls=data.controls)
+    batch = whole(known[[2, 0]])
+    assert batch.inputs is not None and data.controls is not None
+    torch.testing.assert_close(batch.inputs, data.controls[[2, 0]])
+    model, guide = pair(data, Config(latent_dim=2, hidden=(8,)))
+    with torch.no_grad():
+        ahead = model.forecast(batch, GuidePosterior(guide), horizon=6, draws=2)
+    assert ahead.location.shape == (2, 2, 6, 4)
+    windows = Loader(known, batch_size=3, window=2).take(torch.tensor([0, 4, 5]))
+    assert windows.inputs is not None
+    torch.testing.assert_close(windows.inputs[1], data.controls[0, 4:6])
+    torch.testing.assert_close(windows.inputs[2], data.controls[1, 0:2])

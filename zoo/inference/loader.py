@@ -99,7 +99,7 @@ class _Windows:
 
     def __init__(self, data: Sequences, window: int | None, stride: int) -> None:
         frames = data.values.shape[1]
-        self.window = frames if window is None else window
+        self.window, self.is_whole = frames if window is None else window, window is None
         if window is not None:
             _check(data, window, stride)
         padded = data.lengths.clamp(min=self.window)
@@ -113,7 +113,8 @@ class _Windows:
         self.step = torch.arange(self.window)
         gapless = self._is_gapless(data, window)
         self.frame_mask = None if gapless else data.mask.flatten(0, 1)
-        self.controls = None if data.controls is None else data.controls.flatten(0, 1)
+        self.controls = data.controls
+        self.known = self.window if data.controls is None else data.controls.shape[1]
 
     def _is_gapless(self, data: Sequences, window: int | None) -> bool:
         if window is None:
@@ -128,7 +129,7 @@ class _Windows:
         return Batch(
             values=self.frames.index_select(0, index).view(shape),
             mask=_gather(self.frame_mask, index, shape),
-            inputs=_gather(self.controls, index, shape),
+            inputs=self._inputs(rows),
             start=self.start[rows].to(self.device),
             sequence=sequence.to(self.device),
             movements=movements,
@@ -136,6 +137,14 @@ class _Windows:
             total=self.total,
             total_sequences=len(self.movements),
         )
+
+    def _inputs(self, rows: Tensor) -> Tensor | None:
+        """Controls of the windows; of whole movements those of the frames to come as well."""
+        if self.controls is None:
+            return None
+        steps = torch.arange(self.known) if self.is_whole else self.step
+        frame = self.start[rows, None] + steps
+        return self.controls[self.sequence[rows, None], frame]
 
     def _movements(self, sequence: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
         kept, inverse = torch.unique(sequence, return_inverse=True)

@@ -31,7 +31,7 @@ class Config:
     latent_dim: int = 5
     noise_floor: float = 1e-4
     em_iterations: int = 2000
-    em_tolerance: float = 1e-9
+    em_tolerance: float = 1e-7
 
     def __post_init__(self) -> None:
         """Refuse settings without a meaning."""
