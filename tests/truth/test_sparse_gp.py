@@ -218,6 +218,17 @@ def test_newton_and_l_bfgs_find_the_same_optimum():
     assert ends[0] == pytest.approx(ends[1], abs=1e-3)
 
 
+def test_learned_inducing_inputs_gain_on_fixed_ones():
+    data = pairs(items=100)
+    ends = []
+    for learned in (False, True):
+        config = sparse_gp.Config(inducing=10, learn_inducing=learned, compare=False)
+        model = sparse_gp.SparseGaussianProcess(data.layout, config)
+        rows = fit_marginal(model, data, MarginalLikelihood(iterations=20), seed=0)
+        ends.append(rows[-1]["objective"])
+    assert ends[1] < ends[0]
+
+
 def test_noise_that_diverges_is_warned_of():
     data = pairs(items=200, targets=1, noise=0.02)
     few = sparse_gp.SparseGaussianProcess(data.layout, sparse_gp.Config(inducing=8))

@@ -152,6 +152,8 @@ class SparseGaussianProcess(nn.Module):
         with torch.no_grad():
             self.log_length.fill_(median_distance(self._training.among).log())
             self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
+        if self.config.learn_inducing or self.config.ard:
+            self._warm_start()
 
     def objective(self) -> Float[Tensor, ""]:
         """Minus the collapsed bound on the log evidence, summed over targets."""
@@ -163,7 +165,7 @@ class SparseGaussianProcess(nn.Module):
         training = self._need_training()
         self._keep_posterior(training)
         if self.config.bound == "fitc" and self.config.compare:
-            self._compare(training)
+            self._compare()
         self._training = None
 
     @torch.no_grad()
@@ -271,22 +273,39 @@ class SparseGaussianProcess(nn.Module):
             self.pattern[which] = float(i)
         self.information = torch.stack([q.factor for q in found])
 
-    def _compare(self, training: _Training) -> None:
-        """Fit the variational bound from here, on the same distances, and compare the noise."""
-        other = SparseGaussianProcess(
-            self.layout, replace(self.config, bound="vfe", learn_inducing=False)
-        )
+    def _fixed(self, bound: Literal["fitc", "vfe"], **changes: Any) -> SparseGaussianProcess:
+        """The same data and inducing inputs, these held still, optimised from here."""
+        training = self._need_training()
+        config = replace(self.config, bound=bound, learn_inducing=False, compare=False, **changes)
+        other = SparseGaussianProcess(self.layout, config)
         other._set_inducing(self.inducing.detach())
+        among, across = training.among, training.across
         if self.config.learn_inducing:
             among, across = other._distances(training.inputs)
-            training = training._replace(among=among, across=across)
-        mine = training.bound
-        other._training = training._replace(bound=Collapsed(mine.targets, mine.groups, "vfe"))
+        targets, groups = training.bound.targets, training.bound.groups
+        other._training = _Training(
+            training.inputs, Collapsed(targets, groups, bound), among, across
+        )
         with torch.no_grad():
-            other.log_length.copy_(self.log_length)
+            other.log_length.copy_(self.log_length[: len(other.log_length)])
             other.log_noise.copy_(self.log_noise)
-        optimizer: Literal["l-bfgs", "newton"] = "l-bfgs" if self.config.ard else "newton"
+        optimizer: Literal["l-bfgs", "newton"] = "l-bfgs" if config.ard else "newton"
         maximise(other, MarginalLikelihood(optimizer=optimizer), evaluator(other))
+        return other
+
+    def _warm_start(self) -> None:
+        """Start from the best single length scale over inducing inputs that stay where they are.
+
+        All at once from a poor start, the inputs settle in a far worse optimum.
+        """
+        other = self._fixed(self.config.bound, ard=False)
+        with torch.no_grad():
+            self.log_length.copy_(other.log_length.expand_as(self.log_length))
+            self.log_noise.copy_(other.log_noise)
+
+    def _compare(self) -> None:
+        """Fit the variational bound from here and compare the noise."""
+        other = self._fixed("vfe")
         other.settle()
         self.other_noise = other.noise_std
         ratio = torch.maximum(self.noise_std / self.other_noise, self.other_noise / self.noise_std)
