@@ -81,43 +81,47 @@ class Scale:
 
 @dataclass(frozen=True, kw_only=True)
 class Conformal:
-    r"""Normalised split conformal intervals μ ± q(p) σ a b_c d_t.
+    r"""Normalised split conformal intervals μ ± q(p) σ b_c d_t.
 
-    The score is \|y − μ\| / (σ a b_c d_t), with factors fitted without the score's own group. q(p)
+    The score is \|y − μ\| / (σ b_c d_t), with factors fitted without the score's own group. q(p)
     is the smallest score that a share p (1 + 1/G_eff) of the scores does not exceed, each group
-    weighing the same. G_eff = p (1 − p) / s², between the number of groups G and of entries, is
-    what the groups are worth as independent entries: s is the standard error, over groups, of
-    their coverage. Where all entries of a group stand or fall together G_eff = G, the
-    hierarchical conformal quantile with its guarantee for a new group; with one entry a group it
-    is the usual split conformal quantile, (n + 1) p scores out of n. ``reach`` is the widest level
-    that the groups support; beyond it q grows like a Gaussian's. The result is symmetric about
-    the mean and has no density.
+    weighing the same. G_eff (``worth``), between the number of groups G and that of entries,
+    is what the groups are worth as independent entries: p (1 − p) over the squared standard error
+    of the groups' coverages, both summed over p = 50 %, …, 90 %. Where all entries of a group
+    stand or fall together G_eff = G, the hierarchical conformal quantile with its guarantee for a
+    new group; with one entry a group it is the usual split conformal quantile, (n + 1) p scores
+    out of n. Between the two the guarantee is approximate. ``reach`` is the widest level that the
+    groups support; beyond it q grows like a Gaussian's. The result is symmetric about the mean
+    and has no density.
     """
 
     kind: ClassVar[str] = "conformal"
     factors: Factors
     thresholds: Curve
     groups: int
+    worth: float
     reach: float
 
     @classmethod
     def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
         """Factors from all groups, thresholds from scores of groups left out in turn."""
         sizes = standardised(answer).abs()
-        scores = sizes / crossed(sizes, answer, by, 1)
+        scores = sizes / crossed(sizes, answer, by, 1, common=False)
         pooled, weight = _weighted(scores, answer)
-        corrected = _corrected_levels(pooled, weight, scores, answer)
+        worth = _worth(pooled, weight, scores, answer)
+        corrected = _LEVELS * (1 + 1 / worth)
         supported = corrected <= 1
         if not bool(supported.any()):
             raise ValueError(f"{answer.groups} groups are too few for any conformal interval")
         return cls(
-            factors=Factors.fit(sizes, answer, by, 1),
+            factors=Factors.fit(sizes, answer, by, 1, common=False),
             thresholds=Curve.through(
                 _score((1 + _LEVELS[supported]) / 2),
                 _weighted_quantile(pooled, weight, corrected[supported]),
                 from_zero=True,
             ),
             groups=answer.groups,
+            worth=worth,
             reach=float(_LEVELS[supported][-1]),
         )
 
@@ -144,8 +148,8 @@ class Conformal:
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
-        meta = {"kind": self.kind, "groups": self.groups, "reach": self.reach}
-        return meta, {**self.factors.state(), **self.thresholds.state()}
+        meta = {"groups": self.groups, "worth": self.worth, "reach": self.reach}
+        return {"kind": self.kind, **meta}, {**self.factors.state(), **self.thresholds.state()}
 
     @classmethod
     def from_state(cls, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
@@ -154,6 +158,7 @@ class Conformal:
             factors=Factors.from_state(tensors),
             thresholds=Curve.from_state(tensors),
             groups=int(meta["groups"]),
+            worth=float(meta["worth"]),
             reach=float(meta["reach"]),
         )
 
@@ -325,15 +330,15 @@ def _weighted_quantile(ordered: Tensor, share: Tensor, levels: Tensor) -> Tensor
     return ordered[place.clamp(max=len(ordered) - 1)]
 
 
-def _corrected_levels(pooled: Tensor, share: Tensor, scores: Tensor, answer: Answer) -> Tensor:
-    """p (1 + 1/G_eff) for every nominal level."""
+def _worth(pooled: Tensor, share: Tensor, scores: Tensor, answer: Answer) -> float:
+    """G_eff: independent entries that give coverages as certain as these groups do."""
     counts = group_sums(answer.mask.flatten(1).sum(1), answer.cluster)
     present = counts > 0
-    worth = []
-    for p, threshold in zip(_LEVELS, _weighted_quantile(pooled, share, _LEVELS), strict=True):
+    levels = _LEVELS[49:90].to(scores)
+    variance = torch.zeros_like(levels)
+    for i, threshold in enumerate(_weighted_quantile(pooled, share, levels)):
         inside = ((scores <= threshold) & answer.mask).flatten(1).sum(1)
         coverage = group_sums(inside, answer.cluster)[present] / counts[present]
-        error = coverage.var() / answer.groups
-        worth.append((p * (1 - p) / error).clamp(answer.groups, float(counts.sum())))
-    corrected = _LEVELS * (1 + 1 / torch.stack(worth).to(_LEVELS))
-    return corrected.cummax(0).values
+        variance[i] = coverage.var() / answer.groups
+    worth = (levels * (1 - levels)).sum() / variance.sum()
+    return float(worth.clamp(answer.groups, float(counts.sum())))

@@ -34,8 +34,13 @@ class Factors:
     time: Float[Tensor, " time"]
 
     @classmethod
-    def fit(cls, sizes: Tensor, answer: Answer, by: tuple[By, ...], power: float) -> Self:
-        """Factors that make the group-wise mean of ``sizes``, |z|^power, equal to 1."""
+    def fit(
+        cls, sizes: Tensor, answer: Answer, by: tuple[By, ...], power: float, common: bool = True
+    ) -> Self:
+        """Factors that make the group-wise mean of ``sizes``, |z|^power, equal to 1.
+
+        With ``common=False`` a stays 1: only the ratios of channels and lead times are fitted.
+        """
         size, mask = _three_axes(sizes), _three_axes(answer.mask)
         channel = size.new_ones(size.shape[2])
         time = size.new_ones(size.shape[1])
@@ -43,7 +48,9 @@ class Factors:
             channel = _shrunk(_by_group(size, mask, answer, (1,)))
         if "time" in by and size.shape[1] > 1:
             time = _over_time(size / channel, mask, answer)
-        level = _pooled(_by_group(size / channel / time[:, None], mask, answer, (1, 2)))
+        level = size.new_ones(())
+        if common:
+            level = _pooled(_by_group(size / channel / time[:, None], mask, answer, (1, 2)))
         return cls(
             level=level ** (1 / power), channel=channel ** (1 / power), time=time ** (1 / power)
         )
@@ -82,7 +89,9 @@ def standardised(answer: Answer) -> Float[Tensor, "sequence *rest"]:
     return torch.where(answer.mask, z, 0.0)
 
 
-def crossed(sizes: Tensor, answer: Answer, by: tuple[By, ...], power: float) -> Tensor:
+def crossed(
+    sizes: Tensor, answer: Answer, by: tuple[By, ...], power: float, common: bool = True
+) -> Tensor:
     """Factors of every sequence, fitted without the fold of groups that it belongs to."""
     folds = min(_FOLDS, int(answer.cluster.max()) + 1)
     out = torch.ones_like(sizes)
@@ -95,7 +104,7 @@ def crossed(sizes: Tensor, answer: Answer, by: tuple[By, ...], power: float) -> 
             cluster=answer.cluster,
         )
         if bool(held.any()) and bool(rest.mask.any()):
-            out[held] = Factors.fit(sizes, rest, by, power).of(answer.prediction).to(out)
+            out[held] = Factors.fit(sizes, rest, by, power, common).of(answer.prediction).to(out)
     return out
 
 

@@ -131,7 +131,7 @@ class Table:
         table = RichTable(title=self.title, caption=self.legend, box=box.SIMPLE_HEAD)
         table.title_justify = table.caption_justify = "left"
         for i, name in enumerate(self.header):
-            table.add_column(name, justify="left" if i < 2 else "right", no_wrap=i != 0)
+            table.add_column(name, justify="left" if i < 2 else "right", no_wrap=i < 2)
         for cells in self.body:
             table.add_row(*cells)
         return table
@@ -167,7 +167,7 @@ def readable(estimate: Estimate | None) -> str:
     """A number with as many digits as its error leaves it.
 
     >>> readable(Estimate(0.91234, 0.0213)), readable(Estimate(3.312e-4, 4.1e-5)), readable(None)
-    ('0.912 ± 0.021', '(3.31 ± 0.41)·10⁻⁴', '—')
+    ('0.91 ± 0.02', '(3.3 ± 0.4)·10⁻⁴', '—')
     """
     if estimate is None:
         return _ABSENT
@@ -176,7 +176,7 @@ def readable(estimate: Estimate | None) -> str:
         return "∞" if value > 0 else "-∞"
     power = _power(max(abs(value), error or 0.0))
     scale = 10.0**power
-    digits = _digits(error / scale if error else None, value / scale)
+    digits = _digits(None if error is None else error / scale, value / scale)
     text = f"{value / scale:.{digits}f}"
     if error is not None:
         text = f"{text} ± {error / scale:.{digits}f}"
@@ -193,9 +193,13 @@ def _power(size: float) -> int:
 
 
 def _digits(error: float | None, value: float) -> int:
-    """Decimals that show two digits of the error, or three of a value that has none."""
+    """Decimals that show one digit of the error, two of one that starts with 1.
+
+    Without an error three digits of the value are shown.
+    """
     size = error if error else abs(value)
     if not size or not math.isfinite(size):
         return 2
-    wanted = 1 if error else 2
-    return min(6, max(0, wanted - math.floor(math.log10(size))))
+    first = math.floor(math.log10(size))
+    wanted = 2 if error is None else int(size < 2 * 10.0**first)
+    return min(6, max(0, wanted - first))
