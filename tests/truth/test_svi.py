@@ -263,6 +263,17 @@ def test_clipping_bounds_the_step_and_reports_the_unclipped_norm() -> None:
     assert history.rows[0]["grad_norm"] > 1e-2
 
 
+def test_a_huge_gradient_is_clipped_and_not_taken_for_infinite() -> None:
+    model, guide = fresh()
+    model.loadings.register_hook(lambda g: g * 1e30)
+    history = fit_svi(model, guide, lg.frames(), Svi(epochs=2, batch_size=50, clip=1.0))
+    assert min(history.column("grad_norm")) > 1e25
+    assert all(bool(v.isfinite().all()) for v in bits(model, guide))
+    with pytest.raises(TrainingError, match="norm of the gradient"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", TrainingWarning)
+        fit_svi(model, guide, lg.frames(), Svi(epochs=2, batch_size=50, clip=None))
+
+
 def test_early_stopping_restores_the_best_state() -> None:
     model, guide = fresh()
     train, val = lg.frames(1, 2), lg.frames(8, 3)

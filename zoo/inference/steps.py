@@ -59,6 +59,8 @@ class Steps:
         norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
         parts = (terms.loss.detach(), terms.reconstruction, terms.kl, norm)
         *sums, length = torch.stack(parts).tolist()
+        if length == math.inf and self.strategy.clip is not None:
+            length = _long_norm(gradients)
         if not all(map(math.isfinite, (*sums, length))):
             raise NotFiniteError(self._blame(terms))
         self._clip(gradients, length)
@@ -107,6 +109,11 @@ class Steps:
             if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
                 return f"the gradient of {name}"
         return "the norm of the gradient"
+
+
+def _long_norm(gradients: list[Tensor]) -> float:
+    """Norm of gradients that are finite but whose squares overflow their number type."""
+    return math.hypot(*(g.double().norm().item() for g in gradients))
 
 
 def _parameters(model: nn.Module, guide: nn.Module) -> dict[str, nn.Parameter]:
