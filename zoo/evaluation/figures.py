@@ -100,6 +100,7 @@ def forecast_bands(
         _bands(axes, prediction, whole, start, sequence, index)
     for axes in panels[len(indices) :]:
         axes.remove()
+        panels[len(indices) - 2].tick_params(labelbottom=True)
     labels: dict[str, Artist] = {}
     for axes in figure.axes:
         labels |= {str(k): h for h, k in zip(*axes.get_legend_handles_labels(), strict=True)}

@@ -133,7 +133,7 @@ class Table:
         for i, name in enumerate(self.header):
             table.add_column(name, justify="left" if i < 2 else "right", no_wrap=i < 2)
         for cells in self.body:
-            table.add_row(*cells)
+            table.add_row(*(cell.replace("± ", "±\N{NO-BREAK SPACE}") for cell in cells))
         return table
 
     def __str__(self) -> str:
