@@ -198,6 +198,7 @@ def test_only_scale_keeps_a_density() -> None:
     for kind in ("conformal", "isotonic"):
         mended = raw.recalibrated(recalibrate(kind, raw, truth))
         assert score(mended, truth)["nll"] is None
+        assert score(mended, truth)["nll_raw"] == score(raw, truth)["nll"]
         with pytest.raises(NoDensityError, match=f"{kind.title()} corrects quantiles only"):
             mended.log_prob(truth)
 

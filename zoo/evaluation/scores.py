@@ -29,6 +29,7 @@ SCORES: dict[str, tuple[str, str]] = {
     "r2": ("R², mean of channels", ""),
     "std": ("predicted SD, mean", "{unit}"),
     "nll": ("NLL an entry", "nats"),
+    "nll_raw": ("NLL, spread uncorrected", "nats"),
     "crps": ("CRPS", "{unit}"),
     "energy": ("energy score", "{unit}"),
     "variogram": ("variogram score", "{unit}"),
@@ -149,6 +150,9 @@ def _spread_scores(answer: Answer) -> dict[str, Tensor]:
     scores = {"std": prediction.std.double(), "crps": crps(prediction, truth)}
     with suppress(NoDensityError):
         scores["nll"] = -prediction.log_prob(truth).double()
+    with suppress(NoDensityError):
+        if prediction.recalibration is not None:
+            scores["nll_raw"] = -prediction.raw.log_prob(truth).double()
     for level, percent in zip(LEVELS, _PERCENT, strict=True):
         low, high = (end.double() for end in prediction.interval(level))
         arrays = [t.cpu().numpy() for t in (truth, low, high)]

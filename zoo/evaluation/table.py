@@ -164,7 +164,7 @@ class Table:
 
 
 def readable(estimate: Estimate | None) -> str:
-    """A number with as many digits as its error leaves it.
+    """A number with as many digits as its error leaves it; an error of 0 is left out.
 
     >>> readable(Estimate(0.91234, 0.0213)), readable(Estimate(3.312e-4, 4.1e-5)), readable(None)
     ('0.91 ± 0.02', '(3.3 ± 0.4)·10⁻⁴', '—')
@@ -172,6 +172,8 @@ def readable(estimate: Estimate | None) -> str:
     if estimate is None:
         return _ABSENT
     value, error = estimate.value, estimate.error
+    if error is not None and error < 1e-6 * abs(value):
+        error = None
     if not math.isfinite(value):
         return "∞" if value > 0 else "-∞"
     power = _power(max(abs(value), error or 0.0))
