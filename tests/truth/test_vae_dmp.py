@@ -14,7 +14,7 @@ from pyro import poutine
 from torch import Tensor
 
 from zoo.datasets.records import Sequences
-from zoo.dynamics.paths import PathPrior
+from zoo.dynamics.paths import PathPrior, Readout, _stationary
 from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.filtering import FilteringGuide
 from zoo.guides.recurrence import FilteringNoise, _Filter
@@ -272,15 +272,41 @@ def prior(movements: int = 3, time: int = 6) -> PathPrior:
         return root @ root.T / size
 
     spread = torch.stack([covariance(time) for _ in range(LATENT)])
-    process = torch.kron(covariance(time), 0.1 * covariance(LATENT))
     return PathPrior(
         paths=torch.randn(movements, time, LATENT),
         spread=spread,
-        process=process.unflatten(1, (time, LATENT)).unflatten(0, (time, LATENT)),
+        residuals=0.3 * torch.randn(movements, time, LATENT),
         observation=0.2 * covariance(LATENT) + 0.05 * torch.eye(LATENT),
         bandwidth=0.6,
         shrinkage=0.3,
     )
+
+
+def test_stationary_covariance_equals_the_mean_over_lags():
+    torch.manual_seed(8)
+    r = torch.randn(3, 5, LATENT)
+    found = _stationary(r)
+    for t in range(5):
+        for s in range(5):
+            lag = s - t
+            pairs = [(a, a + lag) for a in range(5) if 0 <= a + lag < 5]
+            expected = sum(torch.einsum("mi,mj->ij", r[:, a], r[:, b]) for a, b in pairs) / 15
+            torch.testing.assert_close(found[t, :, s], expected)
+    flat = found.flatten(2).flatten(0, 1)
+    assert torch.linalg.eigvalsh(flat).min() > -1e-12
+
+
+def test_read_out_density_is_that_of_the_linear_map():
+    torch.manual_seed(9)
+    given = prior().condition(torch.zeros(6, LATENT), torch.arange(6) < 2)
+    path, J, std = torch.randn(6, LATENT), torch.randn(6, 3, LATENT), torch.rand(3) + 0.1
+    found = given.log_density(path, Readout(J, std))
+    t, c = 4, 1
+    rows = slice(t * LATENT, (t + 1) * LATENT)
+    variance = J[t, c] @ given.covariance[rows, rows] @ J[t, c] + std[c] ** 2
+    apart = (given.means[:, t] - path[t]) @ J[t, c]
+    each = torch.distributions.Normal(0.0, variance.sqrt()).log_prob(apart)
+    torch.testing.assert_close(found[t, c], torch.logsumexp(each + given.log_weights, 0))
 
 
 @pytest.mark.parametrize("extra", [False, True])
@@ -342,6 +368,7 @@ def test_prior_of_movements_holds_the_paths_of_the_response():
         found = model._latents(drawn)
         u = torch.cat([found.w[0], *(v.transpose(0, 1) for v in (found.goal, found.position))], 1)
         model.prior_movements = torch.cat([u, found.velocity.transpose(0, 1)], 1)
+        model.prior_residuals.zero_()
         args = one["z"][:, 0], one["velocity"], one["w"], one["goal"], 0 * one["epsilon"]
         torch.testing.assert_close(model._prior(FRAMES).paths, model.path(*args, batch))
 

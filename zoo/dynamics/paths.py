@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import Self
+from typing import Any, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-__all__ = ["Conditioned", "PathPrior"]
+__all__ = ["Conditioned", "PathPrior", "Readout"]
 
-BANDWIDTHS = (0.1, 0.3, 0.6, 1.0)
-SHRINKAGES = (0.01, 0.03, 0.1, 0.3, 1.0)
+CHOICES = {
+    "bandwidth": (0.1, 0.3, 0.6, 1.0),
+    "shrinkage": (0.01, 0.1, 0.5),
+    "process": (0.03, 0.3, 1.0),
+}
+LEFT_OUT = 8
 JITTER = 1e-8
 
 
@@ -23,18 +26,20 @@ JITTER = 1e-8
 class PathPrior:
     r"""A mixture over paths z_{1:T} with a component around every known movement.
 
-    p(z) = 1/M Σ_i N(z̄ + √(1−h²)(z_i − z̄), h² ((1−λ) S + λ R) + N): S is the covariance of the
-    known paths z_i = Φ u_i, R that of independent parameters u pushed through the same linear
-    response Φ, N that of the process noise (West 1993). h = 1 is one Gaussian, a small h a kernel
-    estimate that stays near the movements known. Observed frames are y_t ~ N(z_t, E).
+    p(z) = 1/M Σ_i N(z̄ + √(1−h²)(z_i − z̄), h² ((1−λ) S + λ R) + ν N): S is the covariance of the
+    known paths z_i, R that of independent parameters pushed through the same linear response, N
+    that of the stationary ``residuals`` which the response leaves (West 1993). h = 1 is one
+    Gaussian, a small h a kernel estimate that stays near the movements known. Observed frames are
+    y_t ~ N(z_t, E).
     """
 
     paths: Float[Tensor, "movement time latent"]
     spread: Float[Tensor, "latent time time"]
-    process: Float[Tensor, "time latent time latent"]
+    residuals: Float[Tensor, "movement time latent"]
     observation: Float[Tensor, "latent latent"]
     bandwidth: float = 0.3
     shrinkage: float = 0.1
+    process: float = 1.0
 
     @property
     def means(self) -> Float[Tensor, "movement time latent"]:
@@ -45,15 +50,12 @@ class PathPrior:
     @property
     def covariance(self) -> Float[Tensor, "time latent time latent"]:
         """Covariance that all components share."""
-        movements, time, latent = self.paths.shape
-        smooth = torch.zeros(time, latent, time, latent, dtype=self.paths.dtype)
-        for d in range(latent):
-            smooth[:, d, :, d] = self.spread[d]
-        shared = self.shrinkage * smooth
+        movements = len(self.paths)
+        shared = self.shrinkage * torch.einsum("its,ij->tisj", self.spread, _eye(self.observation))
         if movements > 1:
             apart = (self.paths - self.paths.mean(0)) / math.sqrt(movements - 1)
             shared = shared + (1 - self.shrinkage) * torch.einsum("mti,msj->tisj", apart, apart)
-        return self.bandwidth**2 * shared + self.process
+        return self.bandwidth**2 * shared + self.process * _stationary(self.residuals)
 
     def condition(
         self,
@@ -81,29 +83,49 @@ class PathPrior:
             covariance=full - half.mT @ half,
         )
 
-    def tuned(self, seen: Sequence[int]) -> Self:
-        """Bandwidth and shrinkage with the best density of each movement's future, left out.
+    def tuned(self, seen: Sequence[int], readout: Readout) -> Self:
+        """The h, λ and ν with the best density of each movement's future, left out.
 
-        The future is every frame after the first ``seen`` ones, judged frame by frame. A single
-        movement leaves nothing to compare: the defaults stay.
+        The future is every frame after the first ``seen`` ones, judged frame by frame and channel
+        by channel; the three are chosen in turn. Fewer than three movements leave too little to
+        compare: the defaults stay.
         """
         if len(self.paths) < 3:
             return self
-        options = [
-            replace(self, bandwidth=h, shrinkage=s) for h, s in product(BANDWIDTHS, SHRINKAGES)
-        ]
-        return max(options, key=lambda prior: prior.left_out(seen))
+        best = self
+        for name in (*CHOICES, "bandwidth"):
+            options = [best._with(name, value) for value in CHOICES[name]]
+            best = max(options, key=lambda prior: prior.left_out(seen, readout))
+        return best
 
-    def left_out(self, seen: Sequence[int]) -> float:
-        """Mean log density of each movement's future under the others."""
+    def _with(self, name: str, value: float) -> Self:
+        change: dict[str, Any] = {name: value}
+        return replace(self, **change)
+
+    def left_out(self, seen: Sequence[int], readout: Readout) -> float:
+        """Mean log density of movements' futures under the others (of a few movements)."""
         count, time = self.paths.shape[:2]
+        rows = torch.linspace(0, count - 1, min(count, LEFT_OUT)).round().long()
         total = 0.0
-        for i in range(count):
-            others = replace(self, paths=self.paths[torch.arange(count) != i])
+        for i in rows.tolist():
+            kept = torch.arange(count) != i
+            others = replace(self, paths=self.paths[kept], residuals=self.residuals[kept])
             for k in seen:
                 given = others.condition(self.paths[i], torch.arange(time) < k)
-                total += float(given.log_density(self.paths[i], self.observation)[k:].mean())
-        return total / (count * len(seen))
+                total += float(given.log_density(self.paths[i], readout.of(i))[k:].mean())
+        return total / (len(rows) * len(seen))
+
+
+@dataclass(frozen=True)
+class Readout:
+    """What frames show of a path, linear around it: x_t ~ N(J_t (z_t − z_i,t), diag σ²) + x_i,t."""
+
+    jacobian: Float[Tensor, "*movement time channel latent"]
+    std: Float[Tensor, " channel"]
+
+    def of(self, movement: int) -> Readout:
+        """The read-out along one of the movements."""
+        return replace(self, jacobian=self.jacobian[movement])
 
 
 @dataclass(frozen=True)
@@ -127,17 +149,34 @@ class Conditioned:
         return path
 
     def log_density(
-        self, path: Float[Tensor, "*batch time latent"], observation: Float[Tensor, "latent latent"]
-    ) -> Float[Tensor, "*batch time"]:
-        """Log marginal density of every frame of a path seen with noise."""
-        time, latent = self.means.shape[-2:]
+        self, path: Float[Tensor, "time latent"], readout: Readout
+    ) -> Float[Tensor, "time channel"]:
+        """Log marginal density of every channel of every frame, read out along a path."""
+        time, latent = path.shape
         blocks = self.covariance.unflatten(-1, (time, latent)).unflatten(-3, (time, latent))
-        each = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3) + observation
-        frames = torch.distributions.MultivariateNormal(
-            self.means, scale_tril=_cholesky(each).unsqueeze(-4), validate_args=False
-        )
-        joint: Tensor = frames.log_prob(path.unsqueeze(-3)) + self.log_weights[..., None]
-        return torch.logsumexp(joint, dim=-2)
+        J, each = readout.jacobian, blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+        variance = torch.einsum("tci,tij,tcj->tc", J, each, J) + readout.std.square()
+        apart = torch.einsum("tci,mti->mtc", J, self.means - path)
+        normal = torch.distributions.Normal(torch.zeros_like(apart), variance.sqrt())
+        joint: Tensor = normal.log_prob(apart) + self.log_weights[:, None, None]
+        return torch.logsumexp(joint, dim=0)
+
+
+def _stationary(
+    residuals: Float[Tensor, "movement time latent"],
+) -> Float[Tensor, "time latent time latent"]:
+    """Covariance of stationary residuals from their correlation at every lag (never indefinite)."""
+    count, time, _ = residuals.shape
+    spectrum = torch.fft.rfft(residuals, n=2 * time, dim=1)
+    power = torch.einsum("mfi,mfj->fij", spectrum.conj(), spectrum)
+    lags = torch.fft.irfft(power, n=2 * time, dim=0) / (count * time)
+    step = torch.arange(time)
+    covariance: Tensor = lags[(step - step[:, None]) % (2 * time)]
+    return covariance.permute(0, 2, 1, 3)
+
+
+def _eye(matrix: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
+    return torch.eye(len(matrix), dtype=matrix.dtype)
 
 
 def _block_diagonal(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zoo.dynamics.dmp import Response
-from zoo.dynamics.paths import Conditioned, PathPrior
+from zoo.dynamics.paths import Conditioned, PathPrior, Readout
 from zoo.errors import NotFittedError
 from zoo.inference.chain import conditional_draws
 from zoo.models.latent_dmp import Config, LatentDmp
@@ -20,7 +20,7 @@ from zoo.types import Batch, Layout, Posterior
 
 __all__ = ["Config", "VaeDmp"]
 
-_LEARNED = ("prior_movements", "prior_process", "prior_observation", "prior_shape")
+_LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape")
 PRIOR_DRAWS = 32
 CHAINS, BURN_IN, KEPT = 8, 24, 64
 UNSEEN = 1e6
@@ -49,7 +49,7 @@ class VaeDmp(LatentDmp):
     """
 
     prior_movements: Tensor
-    prior_process: Tensor
+    prior_residuals: Tensor
     prior_observation: Tensor
     prior_shape: Tensor
 
@@ -130,20 +130,31 @@ class VaeDmp(LatentDmp):
         return self._decoded(response.states(position, velocity / duration, rest, force)[0])
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
-        """Keep the latents of the training movements, the noise found and how well paths fit."""
-        drawn = posterior.draw(batch, PRIOR_DRAWS)
-        found = self._latents(drawn)
+        """Keep the latents of the training movements, and what the encoder sees beside them.
+
+        The residuals are what the noise ε must add for the paths to pass through the encoded
+        frames; how far new movements may be from those known is found by leaving each out.
+        """
+        found = self._latents(posterior.draw(batch, PRIOR_DRAWS))
         parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
         self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
-        noise = self.system.stiffness * (drawn["epsilon"] @ self.w_noise).flatten(0, 2)
-        self.prior_process = (noise.T @ noise / len(noise)).detach()
-        path = self._paths(drawn, batch, PRIOR_DRAWS)
-        frames = self.embed(posterior.encode(batch.values, batch.mask).mean)
-        apart = (path - frames)[:, _frames_seen(batch)].flatten(0, 1)
-        self.prior_observation = (apart.T @ apart / len(apart)).detach()
-        self.prior_shape = path.new_tensor([PathPrior.bandwidth, PathPrior.shrinkage])
-        tuned = self._prior(self.frames).tuned((self.frames // 7, self.frames // 2))
-        self.prior_shape = path.new_tensor([tuned.bandwidth, tuned.shrinkage])
+        q = posterior.encode(batch.values, batch.mask)
+        frames, seen = self.embed(q.mean), _frames_seen(batch)
+        noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames)[:, seen].flatten(0, 1)
+        self.prior_observation = (noise.T @ noise / len(noise)).detach()
+        self.prior_residuals = torch.zeros_like(frames)
+        self.prior_shape = frames.new_tensor(_shape(PathPrior))
+        rolled = self._prior(self.frames).paths.to(frames)
+        self.prior_residuals = ((frames - rolled) * seen[..., None]).detach()
+        tuned = self._prior(self.frames).tuned(
+            (self.frames // 7, self.frames // 2), self._readout(frames)
+        )
+        self.prior_shape = frames.new_tensor(_shape(tuned))
+
+    def _readout(self, frames: Float[Tensor, "sequence time latent"]) -> Readout:
+        jacobian = torch.func.vmap(torch.func.jacfwd(self.decoder))(frames.flatten(0, 1))
+        shape = (*frames.shape[:2], *jacobian.shape[1:])
+        return Readout(jacobian.detach().double().view(shape), self.output_std.detach().double())
 
     def _latents(self, drawn: dict[str, Tensor]) -> _Latents:
         return _Latents(
@@ -190,7 +201,7 @@ class VaeDmp(LatentDmp):
         """The mixture over latent paths of ``length`` frames, in float64."""
         if not self.prior_movements.numel():
             raise NotFittedError("vae-dmp knows no movements yet; train it by zoo.fit first")
-        u, process = self.prior_movements.double(), self.prior_process.double()
+        u, missing = self.prior_movements.double(), length - self.frames
         response = Response.of(self.system, length, torch.float64, u.device)
         force = self.system.stiffness * torch.cat(
             [self.config.w_scale * self.kernels_at(length - 1), torch.ones(length - 1, 1)], dim=1
@@ -198,16 +209,16 @@ class VaeDmp(LatentDmp):
         start = torch.zeros(2, self.kernels + 3, dtype=torch.float64)
         start[0, -2] = start[1, -1] = 1.0
         φ = response.product(start, nn.functional.pad(force, (0, 2)))[0]
-        still = torch.zeros(2, length - 1, dtype=torch.float64)
-        kicks = response.product(still, torch.eye(length - 1, dtype=torch.float64))[0]
-        shape = self.prior_shape.tolist()
+        residuals = nn.functional.pad(self.prior_residuals.double(), (0, 0, 0, missing))
+        bandwidth, shrinkage, process = self.prior_shape.tolist()
         return PathPrior(
-            paths=φ @ u,
+            paths=φ @ u + residuals,
             spread=torch.einsum("tk,kd,sk->dts", φ, _variances(u), φ),
-            process=torch.einsum("ts,ij->tisj", kicks @ kicks.T, process),
+            residuals=residuals,
             observation=self.prior_observation.double(),
-            bandwidth=shape[0],
-            shrinkage=shape[1],
+            bandwidth=bandwidth,
+            shrinkage=shrinkage,
+            process=process,
         )
 
     def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
@@ -262,6 +273,10 @@ def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row la
     apart = u - u.mean(0) if len(u) > 1 else u
     kernels = apart[:, :-3].square().mean((0, 1)).expand(u.shape[1] - 3, -1)
     return torch.cat([kernels, apart[:, -3:].square().mean(0)])
+
+
+def _shape(prior: PathPrior | type[PathPrior]) -> list[float]:
+    return [prior.bandwidth, prior.shrinkage, prior.process]
 
 
 def _frames_seen(batch: Batch) -> Tensor:
