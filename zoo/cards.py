@@ -77,8 +77,8 @@ class Card:
 def card(name: str) -> Card:
     """The card of a model.
 
-    >>> card("pca").entry.thesis
-    '§4.3.2'
+    >>> card("pca").entry.name
+    'pca'
     """
     entry = CATALOGUE[name]
     return Card(

@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor, nn
+from torch import nn
 
 from zoo.assembly import Assembly, create
 from zoo.datasets.records import Pairs, Sequences
@@ -22,8 +21,9 @@ from zoo.errors import NotCapableError
 from zoo.evaluation.calibration import recalibrate
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
+from zoo.exchange import Answer, Exchange, fingerprints
 from zoo.inference.loader import whole
-from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.posterior import seeded
 from zoo.inference.train import Session, train_model
 from zoo.prediction import Prediction, Predictive, Recalibration
 from zoo.tasks import Setup, Trial, trials
@@ -33,7 +33,6 @@ __all__ = ["Run", "create", "evaluate", "fit", "load"]
 
 Resume = Literal["never", "auto", "must"]
 Method = Literal["conformal", "isotonic", "scale"]
-Answer = Callable[[Batch, Posterior | None], Predictive]
 
 
 @dataclass(kw_only=True)
@@ -41,7 +40,7 @@ class Run:
     """A trained model: predictions in the data's own units, calibration, saving.
 
     ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
-    ``seen`` the group rows of the training data, so that an evaluation on them is noticed.
+    ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed.
     """
 
     assembly: Assembly
@@ -60,6 +59,11 @@ class Run:
     def model(self) -> nn.Module:
         """The trained generative model."""
         return self.assembly.model
+
+    @property
+    def exchange(self) -> Exchange:
+        """Scaling in and out of the model."""
+        return Exchange(assembly=self.assembly, scaler=self.scaler)
 
     @property
     def capabilities(self) -> tuple[str, ...]:
@@ -95,7 +99,7 @@ class Run:
         def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
             return represent(batch, posterior, draws=draws)
 
-        latent = self._answer(data, answer, seed)
+        latent = self.exchange.answer(data, answer, seed)
         count = latent.location.shape[-1]
         return Prediction(
             predictive=latent,
@@ -110,12 +114,12 @@ class Run:
     def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
         """Targets of new inputs, given as Pairs or as an array (item, feature)."""
         regress = self._capability("regress")
-        pairs = self._scaled(self._as_pairs(data))
+        pairs = self.exchange.scaled(self.exchange.pairs(data))
         with seeded(seed, self.assembly.device), torch.no_grad():
             predictive = regress(pairs.inputs, draws=draws)
         layout = self.assembly.layout
         return Prediction(
-            predictive=self._unscaled(predictive, "regress"),
+            predictive=self.exchange.unscaled(predictive, "regress"),
             axes=("item", "target"),
             names=layout.channels,
             units=layout.units,
@@ -144,8 +148,8 @@ class Run:
         generate = self._capability("generate")
         if duration <= 0:
             raise ValueError(f"duration must be positive; got {duration}")
-        target = None if goal is None else self._scaled_goal(goal, len(like))
-        other = None if onto is None else whole(self._scaled(onto))
+        target = None if goal is None else self.exchange.goal(goal, len(like))
+        other = None if onto is None else whole(self.exchange.scaled(onto))
 
         def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
             return generate(
@@ -184,15 +188,6 @@ class Run:
 
         return save_run(self, Path(folder))
 
-    def posterior(self) -> Posterior | None:
-        """The guide, behind the protocol that models use."""
-        guide = self.assembly.guide
-        return None if guide is None else GuidePosterior(guide)
-
-    def check(self, data: Pairs | Sequences) -> None:
-        """Raise unless the model was made for data of this layout."""
-        self.assembly.layout.check(data.layout)
-
     def _capability(self, task: str) -> Callable[..., Predictive]:
         if task not in self.capabilities:
             raise NotCapableError(
@@ -210,7 +205,7 @@ class Run:
         return self._predict(task, data, answer, seed)
 
     def _predict(self, task: Any, data: Sequences, answer: Answer, seed: int) -> Prediction:
-        predictive = self._unscaled(self._answer(data, answer, seed), task)
+        predictive = self.exchange.unscaled(self.exchange.answer(data, answer, seed), task)
         layout = self.assembly.layout
         return Prediction(
             predictive=predictive,
@@ -223,69 +218,13 @@ class Run:
             recalibration=self.recalibrations.get(_question(task, data)),
         )
 
-    def _answer(self, data: Sequences, answer: Answer, seed: int) -> Predictive:
-        scaled = self._scaled(data)
-        if not isinstance(scaled, Sequences):
-            raise TypeError(f"{self.name} predicts Sequences; got {type(data).__name__}")
-        self.model.eval()
-        parts = []
-        with seeded(seed, self.assembly.device), torch.no_grad():
-            for length in sorted(set(scaled.lengths.tolist())):
-                rows = [i for i, n in enumerate(scaled.lengths.tolist()) if n == length]
-                parts.append((rows, answer(whole(scaled[rows]), self.posterior())))
-        return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled))
-
-    def _scaled(self, data: Any) -> Any:
-        self.check(data)
-        return self.scaler.apply(data).to(dtype=self.assembly.dtype, device=self.assembly.device)
-
-    def _unscaled(self, predictive: Predictive, task: str) -> Predictive:
-        if not bool(predictive.location.isfinite().all()):
-            raise FloatingPointError(f"{self.name}: {task} gave values that are not finite")
-        like = predictive.location
-        return predictive.affine(
-            self.scaler.channel_scale.to(like), self.scaler.channel_shift.to(like)
-        )
-
-    def _scaled_goal(self, goal: ArrayLike, count: int) -> Tensor:
-        width = len(self.assembly.layout.channels)
-        array = np.asarray(goal, dtype=np.float64)
-        if array.shape not in ((width,), (count, width)):
-            raise ValueError(
-                f"goal has shape {array.shape}; ({width},) or ({count}, {width}) is needed, "
-                f"in {self.assembly.layout.units[0] or 'data units'}"
-            )
-        rows = torch.from_numpy(np.broadcast_to(array, (count, width)).copy())
-        scaled = (rows - self.scaler.channel_shift) / self.scaler.channel_scale
-        return scaled.to(dtype=self.assembly.dtype, device=self.assembly.device)
-
-    def _as_pairs(self, data: Pairs | ArrayLike) -> Pairs:
-        if isinstance(data, Pairs):
-            return data
-        layout = self.assembly.layout
-        inputs = np.asarray(data, dtype=np.float64)
-        if inputs.ndim != 2 or inputs.shape[1] != len(layout.inputs):
-            raise ValueError(
-                f"inputs have shape {inputs.shape}; (item, {len(layout.inputs)}) is needed"
-            )
-        return Pairs.from_arrays(
-            inputs,
-            np.full((len(inputs), len(layout.channels)), np.nan),
-            features=layout.inputs,
-            feature_units=layout.input_units,
-            channels=layout.channels,
-            units=layout.units,
-        )
-
     def _check_unseen(self, data: Pairs | Sequences, purpose: str) -> None:
-        known = {tuple(row) for row in self.trained_on["rows"]}
-        if sorted(data.groups) != self.trained_on["columns"]:
-            return
-        again = [row for row in _rows(data) if tuple(row) in known]
+        known = set(self.trained_on["fingerprints"])
+        again = sum(f in known for f in fingerprints(data))
         if again:
             warnings.warn(
-                f"{len(again)} of {len(data)} items given for {purpose} were trained on "
-                f"(first: {', '.join(again[0])}); spreads on them look better than they are",
+                f"{again} of {len(data)} movements or items given for {purpose} were trained on; "
+                "spreads on them look better than they are",
                 stacklevel=3,
             )
 
@@ -336,7 +275,7 @@ def fit(
         scaler=scaler,
         history=history,
         seconds=time.monotonic() - began,
-        trained_on={"name": train.name, "columns": sorted(train.groups), "rows": _rows(train)},
+        trained_on={"name": train.name, "fingerprints": fingerprints(train)},
     )
     if folder is not None:
         run.save(folder)
@@ -371,37 +310,3 @@ def _question(task: str, data: Sequences) -> str:
     inside = torch.arange(data.values.shape[1]) < data.lengths[:, None]
     section = bool((inside & ~data.mask.any(-1)).any())
     return "impute section" if section else "impute joints"
-
-
-def _rows(data: Pairs | Sequences) -> list[list[str]]:
-    columns = [data.groups[key] for key in sorted(data.groups)]
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _merge(parts: Sequence[tuple[Sequence[int], Predictive]], count: int) -> Predictive:
-    """Predictives of movements of several lengths as one, padded with zeros in time."""
-
-    def join(tensors: list[Tensor | None], expand: bool) -> Tensor | None:
-        if any(t is None for t in tensors):
-            return None
-        full = [
-            t.expand_as(p.location) if expand else t
-            for t, (_, p) in zip(tensors, parts, strict=True)
-            if t is not None
-        ]
-        longest = max(t.shape[2] for t in full)
-        out = full[0].new_zeros(full[0].shape[0], count, longest, full[0].shape[3])
-        for (rows, _), t in zip(parts, full, strict=True):
-            out[:, list(rows), : t.shape[2]] = t
-        return out
-
-    location = join([p.location for _, p in parts], False)
-    if location is None:
-        raise ValueError("nothing to merge")
-    return Predictive(
-        location=location,
-        noise=join([p.noise for _, p in parts], True),
-        epistemic=join([p.epistemic for _, p in parts], True),
-        joint=all(p.joint for _, p in parts),
-        draws=join([p.draws for _, p in parts], False),
-    )

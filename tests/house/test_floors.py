@@ -27,6 +27,7 @@ FLOORS = {
     "zoo.catalogue": 3,
     "zoo.assembly": 4,
     "zoo.tasks": 4,
+    "zoo.exchange": 4,
     "zoo.run": 4,
     "zoo.storage": 4,
     "zoo.cards": 5,

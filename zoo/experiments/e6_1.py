@@ -59,9 +59,12 @@ def run(*, quick: bool, progress: bool) -> Result:
 def _fitted(
     name: str, data: Sequences, latent: int, label: str, quick: bool, progress: bool
 ) -> Run:
-    short = {"epochs": 5} if quick else {}
     folder = Path("runs") / "E6.1" / f"{name}-{label.replace(' ', '-')}{'-quick' if quick else ''}"
-    assembly = create(name, data, seed=SEED, latent_dim=latent, scaling="center", **short)
+    assembly = (
+        create(name, data, seed=SEED, latent_dim=latent, epochs=5)
+        if quick
+        else create(name, data, seed=SEED, latent_dim=latent)
+    )
     return fit(assembly, data, run_dir=folder, resume="auto", progress=progress)
 
 

@@ -1,0 +1,142 @@
+"""Between the data's own units and a model's numbers: scaling, equal lengths, random streams."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from zoo.assembly import Assembly
+from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.scaling import Scaler
+from zoo.inference.loader import whole
+from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.prediction import Predictive
+from zoo.types import Batch, Posterior
+
+__all__ = ["Answer", "Exchange", "fingerprints"]
+
+Answer = Callable[[Batch, Posterior | None], Predictive]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exchange:
+    """What goes into a trained model is scaled here, what comes out is brought back."""
+
+    assembly: Assembly
+    scaler: Scaler
+
+    def scaled(self, data: Any) -> Any:
+        """Data of the right layout, in the model's scale, number type and device."""
+        self.assembly.layout.check(data.layout)
+        return self.scaler.apply(data).to(dtype=self.assembly.dtype, device=self.assembly.device)
+
+    def unscaled(self, predictive: Predictive, task: str) -> Predictive:
+        """A finite answer in the data's units."""
+        if not bool(predictive.location.isfinite().all()):
+            raise FloatingPointError(
+                f"{self.assembly.entry.name}: {task} gave values that are not finite"
+            )
+        like = predictive.location
+        return predictive.affine(
+            self.scaler.channel_scale.to(like), self.scaler.channel_shift.to(like)
+        )
+
+    def answer(self, data: Sequences, answer: Answer, seed: int) -> Predictive:
+        """Ask about movements of one length at a time, on a random stream of its own."""
+        scaled = self.scaled(data)
+        if not isinstance(scaled, Sequences):
+            raise TypeError(
+                f"{self.assembly.entry.name} predicts Sequences; got {type(data).__name__}"
+            )
+        lengths = scaled.lengths.tolist()
+        guide = self.assembly.guide
+        posterior = None if guide is None else GuidePosterior(guide)
+        parts = []
+        with seeded(seed, self.assembly.device), torch.no_grad():
+            for length in sorted(set(lengths)):
+                rows = [i for i, n in enumerate(lengths) if n == length]
+                parts.append((rows, answer(whole(scaled[rows]), posterior)))
+        return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled))
+
+    def goal(self, goal: ArrayLike, count: int) -> Tensor:
+        """A last frame to reach, for each of ``count`` movements, in the model's scale."""
+        layout = self.assembly.layout
+        width = len(layout.channels)
+        array = np.asarray(goal, dtype=np.float64)
+        if array.shape not in ((width,), (count, width)):
+            raise ValueError(
+                f"goal has shape {array.shape}; ({width},) or ({count}, {width}) is needed, "
+                f"in {layout.units[0] or 'the units of the data'}"
+            )
+        rows = torch.from_numpy(np.broadcast_to(array, (count, width)).copy())
+        scaled = (rows - self.scaler.channel_shift) / self.scaler.channel_scale
+        return scaled.to(dtype=self.assembly.dtype, device=self.assembly.device)
+
+    def pairs(self, data: Pairs | ArrayLike) -> Pairs:
+        """Inputs without targets as pairs of the model's layout."""
+        if isinstance(data, Pairs):
+            return data
+        layout = self.assembly.layout
+        inputs = np.asarray(data, dtype=np.float64)
+        if inputs.ndim != 2 or inputs.shape[1] != len(layout.inputs):
+            raise ValueError(
+                f"inputs have shape {inputs.shape}; (item, {len(layout.inputs)}) is needed"
+            )
+        return Pairs.from_arrays(
+            inputs,
+            np.full((len(inputs), len(layout.channels)), np.nan),
+            features=layout.inputs,
+            feature_units=layout.input_units,
+            channels=layout.channels,
+            units=layout.units,
+        )
+
+
+def fingerprints(data: Pairs | Sequences) -> list[str]:
+    """A short hash of every movement or item: equal data have equal ones."""
+    if isinstance(data, Pairs):
+        rows = [torch.cat([x[:64], y]) for x, y in zip(data.inputs, data.targets, strict=True)]
+    else:
+        rows = [v[:n] for v, n in zip(data.values, data.lengths.tolist(), strict=True)]
+    content = (r.double().cpu().contiguous().numpy().tobytes() for r in rows)
+    return [hashlib.blake2b(c, digest_size=8).hexdigest() for c in content]
+
+
+def _merge(parts: Sequence[tuple[Sequence[int], Predictive]], count: int) -> Predictive:
+    """Predictives of movements of several lengths as one, padded with zeros in time."""
+    answers = [p for _, p in parts]
+    rows = [list(r) for r, _ in parts]
+    noise = [None if p.noise is None else p.noise.expand_as(p.location) for p in answers]
+    epistemic = [
+        None if p.epistemic is None else p.epistemic.expand_as(p.location) for p in answers
+    ]
+    location = _padded(rows, [p.location for p in answers], count)
+    if location is None:
+        raise ValueError("a model gave no location")
+    return Predictive(
+        location=location,
+        noise=_padded(rows, noise, count),
+        epistemic=_padded(rows, epistemic, count),
+        joint=all(p.joint for p in answers),
+        draws=_padded(rows, [p.draws for p in answers], count),
+    )
+
+
+def _padded(
+    rows: Sequence[list[int]], tensors: Sequence[Tensor | None], count: int
+) -> Tensor | None:
+    known = [t for t in tensors if t is not None]
+    if len(known) < len(tensors):
+        return None
+    longest = max(t.shape[2] for t in known)
+    out = known[0].new_zeros(known[0].shape[0], count, longest, known[0].shape[3])
+    for row, tensor in zip(rows, known, strict=True):
+        out[:, row, : tensor.shape[2]] = tensor
+    return out
