@@ -15,12 +15,16 @@ from zoo.dynamics.imitation import locally_weighted_regression, target_force
 from zoo.dynamics.population import Population, estimate
 from zoo.dynamics.rollout import Primitive, Timing, path_noise, roll_out, sight
 
-__all__ = ["Learned", "anchors", "learn", "period_of", "phases"]
+__all__ = ["Learned", "Learning", "anchors", "learn", "period_of", "phases"]
 
 RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 SHRINKAGES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.0)
 FOLDS = 5
-PHASES = 24
+PHASES = 16
+TEMPOS = (1.0, 0.8, 0.9, 1.1, 1.25)
+NOISE_OF = {"path": 100.0, "force": 1e-4}
+
+Learning = Literal["path", "force", "lwr"]
 
 
 @dataclass(frozen=True)
@@ -53,12 +57,11 @@ class _Fit:
     uncertainty: Float[Tensor, "channel parameter parameter"]
     noise: Float[Tensor, " channel"]
     ratio: Float[Tensor, " channel"]
-    log_evidence: Float[Tensor, " channel"]
 
 
 def learn(
     primitive: Primitive,
-    learning: Literal["bayes", "lwr"],
+    learning: Learning,
     period: float | None,
     values: Float[Tensor, "sequence time channel"],
     mask: Bool[Tensor, "sequence time channel"],
@@ -72,10 +75,9 @@ def learn(
     starts = torch.stack(
         [anchors(primitive, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)]
     )
-    weights = _local_weights(primitive, movements, timings, starts) if learning == "lwr" else None
     floor = _floor(movements, timings, primitive.kernels)
-    given = starts if weights is None else torch.cat([starts, weights], dim=2)
-    fit = _best([_fit(primitive, ratio, movements, timings, given) for ratio in RATIOS])
+    parameters, uncertainty = _weights(primitive, learning, movements, timings, starts)
+    fit = _residuals(primitive, movements, timings, parameters, uncertainty)
     whole = _sums(primitive, fit.ratio, movements, timings)
     begun = _sums(primitive, fit.ratio, [_begun(x, seen) for x, seen in movements], timings)
     shrinkage = _shrinkage(fit, whole, begun, floor)
@@ -131,8 +133,10 @@ def period_of(movements: list[tuple[Tensor, Tensor]]) -> float:
 
 
 def phases(period: float) -> list[Timing]:
-    """Timings of a rhythmic movement, all over the circle."""
-    return [Timing(period, 2 * math.pi * i / PHASES) for i in range(PHASES)]
+    """Timings that a rhythmic movement may have: tempos around ``period``, all over the circle."""
+    return [
+        Timing(period * tempo, 2 * math.pi * i / PHASES) for tempo in TEMPOS for i in range(PHASES)
+    ]
 
 
 def _timings(
@@ -227,58 +231,53 @@ def _uniform(ratio: float, movements: list[tuple[Tensor, Tensor]]) -> Float[Tens
     return torch.full((movements[0][0].shape[1],), ratio, dtype=torch.float64)
 
 
-def _fit(
+def _weights(
     primitive: Primitive,
-    ratio: float,
+    learning: Learning,
     movements: list[tuple[Tensor, Tensor]],
     timings: list[Timing],
-    given: Tensor,
+    starts: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """θ of every movement and its mean posterior covariance."""
+    if learning == "lwr":
+        weights = _local_weights(primitive, movements, timings, starts)
+        size = starts.shape[2] + weights.shape[2]
+        none = starts.new_zeros(starts.shape[1], size, size)
+        return torch.cat([starts, weights], dim=2), none
+    sums = _sums(primitive, _uniform(NOISE_OF[learning], movements), movements, timings)
+    precision, linear = _of_weights(sums, starts)
+    count, square = (sums.count - 3).clamp_min(0), _square_after(sums, starts)
+    found = conjugate_weights(precision, linear, square, count, sums.log_volume)
+    spread = found.noise[:, None, None] * found.covariance.mean(0)
+    uncertainty = torch.nn.functional.pad(spread, (3, 0, 3, 0))
+    return torch.cat([starts, found.mean], dim=2), uncertainty
+
+
+def _residuals(
+    primitive: Primitive,
+    movements: list[tuple[Tensor, Tensor]],
+    timings: list[Timing],
+    parameters: Tensor,
+    uncertainty: Tensor,
 ) -> _Fit:
-    """Weights after the anchors, or the residuals of weights that are ``given`` too."""
-    every = _uniform(ratio, movements)
-    sums = _sums(primitive, every, movements, timings)
-    find = _conjugate if given.shape[2] == 3 else _plain
-    return find(sums, given, every)
-
-
-def _best(fits: list[_Fit]) -> _Fit:
-    """Of every channel the fit with the highest evidence."""
-    winner = torch.stack([fit.log_evidence for fit in fits]).argmax(0)
-    rows = torch.arange(len(winner))
-
-    def pick(name: str, axis: int) -> Tensor:
-        stacked = torch.stack([getattr(fit, name) for fit in fits])
-        return stacked[winner, :, rows].movedim(0, 1) if axis else stacked[winner, rows]
-
-    names = ("uncertainty", "noise", "ratio", "log_evidence")
-    return _Fit(parameters=pick("parameters", 1), **{name: pick(name, 0) for name in names})
+    """σ² and ρ of every channel that make the residuals of the roll-outs most probable."""
+    noises, scores = [], []
+    for ratio in RATIOS:
+        sums = _sums(primitive, _uniform(ratio, movements), movements, timings)
+        count, square = (sums.count - 3).clamp_min(0), _square_after(sums, parameters)
+        noise = (square.sum(0) / count.sum(0).clamp_min(1)).clamp_min(FLOOR)
+        each = square / noise / 2 + count / 2 * noise.log() + sums.log_volume
+        noises.append(noise)
+        scores.append(-each.sum(0))
+    winner, rows = torch.stack(scores).argmax(0), torch.arange(len(scores[0]))
+    ratio_of = torch.tensor(RATIOS, dtype=parameters.dtype)[winner]
+    return _Fit(parameters, uncertainty, torch.stack(noises)[winner, rows], ratio_of)
 
 
 def _begun(x: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     """A movement of which only the first quarter is seen."""
     early = torch.arange(len(x))[:, None] < max(2, len(x) // 4)
     return x, seen & early
-
-
-def _conjugate(sums: _Sums, starts: Tensor, ratio: Tensor) -> _Fit:
-    precision, linear = _of_weights(sums, starts)
-    count = (sums.count - 3).clamp_min(0)
-    square = _square_after(sums, starts)
-    found = conjugate_weights(precision, linear, square, count, sums.log_volume)
-    spread = found.noise[:, None, None] * found.covariance.mean(0)
-    uncertainty = torch.nn.functional.pad(spread, (3, 0, 3, 0))
-    parameters = torch.cat([starts, found.mean], dim=2)
-    return _Fit(parameters, uncertainty, found.noise, ratio, found.log_evidence)
-
-
-def _plain(sums: _Sums, parameters: Tensor, ratio: Tensor) -> _Fit:
-    count = (sums.count - 3).clamp_min(0)
-    square = _square_after(sums, parameters)
-    noise = (square.sum(0) / count.sum(0).clamp_min(1)).clamp_min(FLOOR)
-    each = square / noise / 2 + count / 2 * noise.log() + sums.log_volume
-    size = parameters.shape[2]
-    none = parameters.new_zeros(parameters.shape[1], size, size)
-    return _Fit(parameters, none, noise, ratio, -each.sum(0))
 
 
 def _local_weights(

@@ -17,7 +17,7 @@ from zoo.datasets.records import Sequences
 from zoo.dynamics.components import Components, Paths, resample
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.imitation import trajectory_matrix
-from zoo.dynamics.learning import learn, phases
+from zoo.dynamics.learning import Learning, learn, phases
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Primitive, Sight, Timing, path_noise, roll_out, sight
 from zoo.errors import NotFittedError
@@ -43,15 +43,16 @@ class Case:
 class Config:
     """Settings of :class:`DMP`; times are in units of the movement's duration or period.
 
-    ``learning`` is ``bayes``, the conjugate posterior, or ``lwr``, locally weighted regression
-    (61). ``beta`` None is α/4, critical damping. ``gated`` multiplies the forcing term by the
-    phase s. ``period`` of rhythmic movements is in s; None finds it by autocorrelation.
-    ``goal_scaling`` scales the forcing term by (g − y₁) when the goal is changed; joints whose
-    fitted |g − y₁| is below ``least_amplitude`` (scaled units) are scaled less.
+    ``learning`` is ``path``, the conjugate posterior of w under white noise of the path; ``force``,
+    that under white noise of f_target; or ``lwr``, locally weighted regression (61). ``beta`` None
+    is α/4, critical damping. ``gated`` multiplies the forcing term by the phase s. ``period`` of
+    rhythmic movements is in s; None finds it by autocorrelation. ``goal_scaling`` scales the
+    forcing term by (g − y₁) when the goal is changed; joints whose fitted |g − y₁| is below
+    ``least_amplitude`` (scaled units) are scaled less.
     """
 
     kind: Literal["discrete", "rhythmic"] = "discrete"
-    learning: Literal["bayes", "lwr"] = "bayes"
+    learning: Learning = "path"
     kernels: int = 20
     alpha: float = 25.0
     beta: float | None = None
@@ -79,20 +80,23 @@ class DMP(nn.Module):
 
         τ² ÿ = α (β (g − y) − τ ẏ) + Ψ(s)w + σ_f ε,   x_t ~ N(y_t, σ² ρ),   ε ~ N(0, 1)
 
-    so that f_target ~ N(Ψ(s)w, σ_f²), (59). θ = (y₁, ẏ₁, g, w) is Gaussian over movements,
-    with factors that joints share and a part of each joint alone (a covariance over movements that
-    is shrunk; the share is chosen by the density of movements left out). As positions are linear in
-    θ and ε, forecasts, filled gaps, other goals, durations and switching (89) are exact Gaussians.
-    A forecast conditions weights, goal and first state on the frames seen; where training movements
-    differ in duration, or in phase for ``rhythmic``, it is a mixture over these.
+    so that f_target ~ N(Ψ(s)w, σ_f²), (59). θ = (y₁, ẏ₁, g, w) is Gaussian over movements, with
+    factors that joints share and a part of each joint alone; how much is shared is chosen by the
+    density of movements left out. As positions are linear in θ and ε, forecasts, filled gaps, other
+    goals, durations and switching (89) are exact Gaussians given the timing. A forecast conditions
+    weights, goal and first state on the frames seen. Where training movements differ in duration,
+    and for rhythmic movements in tempo and phase, it is a mixture over these timings.
 
     Thesis §2.2.1, (53)–(62), §6.2.4, §6.2.5; Ijspeert et al., *Dynamical movement primitives*,
-    Neural Computation 25 (2013); population of weights as in Paraschos et al., *Probabilistic
-    movement primitives*, NIPS 2013. Defaults: 20 kernels (§5.3.2), α = 25, β = α/4, forcing term
-    without gate as (54) has it, Ijspeert's widths. Noise and prior variances by evidence
-    maximisation. ``epistemic`` is the spread of the path y: of θ and of the forces ε; ``noise`` is
-    that of the observation. With a single training movement, spread over movements is unknown: its
-    first state and goal get the spread over time. Variances are point estimates.
+    Neural Computation 25 (2013); Gaussian weights over movements as Paraschos et al.,
+    *Probabilistic movement primitives*, NIPS 2013. Defaults: 20 kernels (§5.3.2), α = 25, β = α/4,
+    no gate on the forcing term as in (54), widths of Ijspeert's code. Prior variance of w by
+    evidence maximisation, σ² and ρ by the likelihood of the residuals. ``epistemic`` is the spread
+    of the path y, of θ and of the forces ε; ``noise`` that of the observation.
+
+    It cannot know spread over movements from a single one: its first state and goal then get the
+    spread over time. Variances and period are point estimates. Steps must be short against the
+    movement: some 17 frames at least with α = 25.
     """
 
     config_class: ClassVar[type] = Config
@@ -247,13 +251,17 @@ class DMP(nn.Module):
         render: Callable[[Case], Paths],
         draws: int,
     ) -> Components:
-        """A mixture over timings, resampled to ``count`` components (1: the likeliest timing)."""
+        """A mixture over timings, resampled to ``count`` components (1: the likeliest timing).
+
+        Residuals of joints go together, so that all joints count as one: evidence a joint.
+        """
         self._check_fitted()
         parts = Components.empty(count, draws, values)
         for rows, mask in _alike(seen):
             x = values[rows] * mask
             views = [self._sight(mask, timing) for timing in timings]
-            picks = resample(torch.stack([self._evidence(view, x) for view in views]), count)
+            evidence = torch.stack([self._evidence(view, x) for view in views])
+            picks = resample(evidence / len(self.noise), count)
             for i in picks.unique().tolist():
                 some = (picks == i).any(0)
                 case = self._case(views[i], timings[i], x[some])

@@ -1,0 +1,296 @@
+"""Dynamic movement primitives: learning, exact conditioning and generation by other roads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from zoo.datasets.records import Sequences
+from zoo.dynamics.dmp import Response, Transformation, discrete_basis, phase
+from zoo.dynamics.imitation import (
+    central_target_force,
+    fit_matrix,
+    locally_weighted_regression,
+    ridge_regression,
+    stationary_variance,
+    target_force,
+    trajectory_matrix,
+)
+from zoo.dynamics.learning import period_of
+from zoo.dynamics.population import Population
+from zoo.dynamics.rollout import Timing, path_noise, roll_out
+from zoo.errors import NotFittedError
+from zoo.inference.loader import whole
+from zoo.inference.posterior import seeded
+from zoo.models.dmp import DMP, Config
+
+SYSTEM = Transformation(dt=1 / 59)
+FRAMES, CHANNELS = 30, 2
+
+
+def movement(seed=0, frames=60, channels=3):
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 1, frames)[:, None]
+    wave = np.sin(2 * np.pi * (rng.uniform(0.5, 2, channels) * time + rng.random(channels)))
+    return torch.from_numpy(wave + rng.normal(size=channels) * time)
+
+
+def test_roll_out_of_the_target_force_is_the_demonstration():
+    x = movement()[None]
+    velocity, force = target_force(x, x[:, -1], SYSTEM)
+    z, _ = Response.of(SYSTEM, 60).states(x[:, 0], velocity, x[:, -1], force)
+    torch.testing.assert_close(z, x, rtol=0, atol=1e-11)
+
+
+def test_locally_weighted_regression_is_weighted_least_squares():
+    x, time = movement(), torch.arange(59, dtype=torch.float64)
+    _, force = target_force(x, x[-1], SYSTEM)
+    psi = discrete_basis(time, kernels=6, duration=59, normalised=False)
+    ξ = phase(time, duration=59)
+    mask = torch.rand(59, 3, generator=torch.Generator().manual_seed(0)) < 0.8
+    found = locally_weighted_regression(psi, force, scale=ξ, mask=mask)
+    for i in range(6):
+        for c in range(3):
+            root = (psi[:, i] * mask[:, c]).sqrt()
+            solution = np.linalg.lstsq((root * ξ)[:, None], root * force[:, c], rcond=None)[0]
+            assert float(found[i, c]) == pytest.approx(float(solution[0]), rel=1e-9)
+
+
+def test_fit_matrix_is_the_ridge_regression_of_the_target_force():
+    x = movement()
+    design = discrete_basis(torch.arange(60, dtype=torch.float64), kernels=8, duration=59)
+    expected = ridge_regression(design, central_target_force(x, x[-1], SYSTEM), 0.1)
+    torch.testing.assert_close(fit_matrix(design, SYSTEM, 0.1) @ x, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_weights_and_movement_equal_those_of_movement_primitives():
+    peers = pytest.importorskip("movement_primitives.dmp", reason="extra bench is not installed")
+    x, frames = movement(frames=200), 200
+    peer = peers.DMP(3, execution_time=1.0, dt=1 / 199, int_dt=1 / 199, n_weights_per_dim=12)
+    peer.imitate(np.linspace(0, 1, frames), x.numpy())
+    time = torch.arange(frames, dtype=torch.float64)
+    spread = 1 / math.sqrt(-2 * math.log(0.8))
+    basis = discrete_basis(time, kernels=12, duration=199, spread=spread)
+    design = basis * phase(time, duration=199)[:, None]
+    system = Transformation(dt=1 / 199)
+    weights = ridge_regression(design, central_target_force(x, x[-1], system))
+    theirs = torch.from_numpy(peer.forcing_term.weights_.T)
+    torch.testing.assert_close(weights, theirs, rtol=1e-8, atol=1e-8 * float(theirs.abs().max()))
+    matrix = trajectory_matrix(Response.of(system, frames), design[1:])
+    path = matrix @ torch.cat([x[:1], torch.zeros_like(x[:1]), x[-1:], theirs])
+    expected = torch.from_numpy(peer.open_loop(step_function="euler")[1][:frames])
+    torch.testing.assert_close(path, expected, rtol=0, atol=1e-8)
+
+
+def test_long_run_variance_by_summing_the_response():
+    noise = Response.of(SYSTEM, 600).product(
+        torch.zeros(2, 599, dtype=torch.float64), torch.eye(599, dtype=torch.float64)
+    )[0]
+    assert stationary_variance(SYSTEM) == pytest.approx(float(noise[-1].square().sum()), rel=1e-9)
+
+
+def random_population(channels=CHANNELS, parameters=4, factors=2):
+    generator = torch.Generator().manual_seed(3)
+    shapes = [(channels, parameters), (channels, parameters, factors)]
+    mean, shared = (torch.randn(s, generator=generator, dtype=torch.float64) for s in shapes)
+    private = torch.randn(channels, parameters, parameters, generator=generator).double() / 2
+    return Population(mean, shared, private)
+
+
+def dense(population):
+    """Mean and covariance of the channels' parameters in one vector."""
+    shared = population.factors.flatten(0, 1)
+    alone = torch.block_diag(*(v @ v.T for v in population.private))
+    return population.mean.flatten(), shared @ shared.T + alone
+
+
+def test_population_is_a_dense_gaussian():
+    population = random_population()
+    generator = torch.Generator().manual_seed(4)
+    root = torch.randn(2, 4, 3, generator=generator).double()
+    precision, linear = root @ root.mT, torch.randn(5, 2, 4, generator=generator).double()
+    mean, covariance = dense(population)
+    information = torch.linalg.inv(covariance)
+    total = information + torch.block_diag(*precision)
+    right = (information @ mean) + linear.flatten(1)
+    found = population.condition(precision, linear)
+    expected = torch.linalg.solve(total, right.T).T
+    torch.testing.assert_close(found.mean.flatten(1), expected, rtol=1e-8, atol=1e-8)
+    one = Population(found.mean[0], found.factors, found.private)
+    torch.testing.assert_close(dense(one)[1], torch.linalg.inv(total), rtol=1e-8, atol=1e-8)
+    evidence = (
+        (right * expected).sum(1) - mean @ information @ mean - torch.logdet(total @ covariance)
+    ) / 2
+    torch.testing.assert_close(population.log_evidence(precision, linear), evidence)
+
+
+def trained(count=6, seed=0, **settings):
+    arrays = [movement(seed + i, FRAMES, CHANNELS).numpy() for i in range(count)]
+    data = Sequences.from_arrays(arrays, rate=30.0)
+    model = DMP(data.layout, Config(kernels=5, **settings))
+    model.condition(data)
+    return model, data
+
+
+def joint(model, timing=None):
+    """Mean, covariance of the path and the observation noise, (channel, time) in one vector."""
+    timing = Timing(FRAMES - 1.0) if timing is None else timing
+    design = torch.block_diag(*[roll_out(model.primitive, FRAMES, timing)] * CHANNELS)
+    forces = path_noise(model.primitive, FRAMES, timing)
+    process = [v * forces @ forces.T for v in model.noise.square()]
+    mean, covariance = dense(model.population)
+    noise = (model.noise.square() * model.ratio).repeat_interleave(FRAMES)
+    return design @ mean, design @ covariance @ design.T + torch.block_diag(*process), noise
+
+
+def test_forecast_and_filled_gap_are_the_conditional_of_the_dense_gaussian():
+    model, data = trained()
+    mean, covariance, noise = joint(model)
+    x = data.values[0].T.flatten()
+    for seen in (torch.arange(FRAMES) < 10, (torch.arange(FRAMES) - 15).abs() > 4):
+        s = seen.repeat(CHANNELS)
+        gain = covariance[:, s] @ torch.linalg.inv(covariance[s][:, s] + torch.diag(noise[s]))
+        path = (mean + gain @ (x[s] - mean[s])).view(CHANNELS, FRAMES).T
+        spread = (covariance - gain @ covariance[s]).diagonal().view(CHANNELS, FRAMES).T.sqrt()
+        batch = whole(data[[0]])
+        hidden = seen[None, :, None].expand_as(batch.values)
+        masked = type(batch)(**{**vars(batch), "values": batch.values * hidden, "mask": hidden})
+        found = model.impute(masked, None, draws=2)
+        torch.testing.assert_close(found.location[0, 0], path, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(found.epistemic[0, 0], spread, rtol=1e-5, atol=1e-5)
+    whole_path = model.forecast(whole(data[[0]].first(10)), None, horizon=20, draws=2)
+    hidden = (torch.arange(FRAMES) < 10)[None, :, None].expand(1, -1, CHANNELS)
+    begun = type(batch)(**{**vars(batch), "values": batch.values * hidden, "mask": hidden})
+    filled = model.impute(begun, None, draws=2)
+    torch.testing.assert_close(whole_path.location, filled.location[:, :, 10:])
+    torch.testing.assert_close(whole_path.epistemic, filled.epistemic[:, :, 10:])
+
+
+def test_draws_have_the_exact_moments():
+    model, data = trained()
+    count = 4000
+    with seeded(0):
+        found = model.forecast(whole(data[[1]].first(8)), None, horizon=22, draws=count)
+    error = (found.draws.mean(0) - found.location[0]).abs() / found.epistemic[0]
+    assert error.max() < 6 / count**0.5
+    ratio = found.draws.var(0) / found.epistemic[0].square()
+    assert (ratio - 1).abs().max() < 6 * (2 / count) ** 0.5
+
+
+def test_program_draws_from_the_same_gaussian():
+    model, _ = trained()
+    many = Sequences.from_arrays(np.zeros((4000, FRAMES, CHANNELS)), rate=30.0)
+    with seeded(1):
+        paths = model(whole(many))
+    mean, covariance, _ = joint(model)
+    path = mean.view(CHANNELS, FRAMES).T
+    spread = covariance.diagonal().view(CHANNELS, FRAMES).T.sqrt()
+    assert ((paths.mean(0) - path).abs() / spread).max() < 6 / len(many) ** 0.5
+    ratio = paths.var(0) / spread.square()
+    assert (ratio - 1).abs().max() < 6 * (2 / len(many)) ** 0.5
+
+
+def test_bands_cover_data_drawn_from_the_model():
+    model, _ = trained()
+    count = 1000
+    blank = Sequences.from_arrays(np.zeros((count, FRAMES, CHANNELS)), rate=30.0)
+    with seeded(2):
+        y = model(whole(blank)).detach()
+        x = y + model.noise * model.ratio.sqrt() * torch.randn_like(y)
+    drawn = Sequences.from_arrays(x.numpy(), rate=30.0)
+    found = model.forecast(whole(drawn.first(9)), None, horizon=FRAMES - 9, draws=1)
+    std = (found.noise.square() + found.epistemic.square()).sqrt()[0, :, 10, 0]
+    inside = ((x[:, 19, 0] - found.location[0, :, 10, 0]) / std).abs() < 1.6448536
+    assert abs(float(inside.double().mean()) - 0.9) < 6 * (0.09 / count) ** 0.5
+
+
+def generate(model, batch, **changes):
+    settings = {"goal": None, "duration": 1.0, "onto": None, "start": 0, "steps": 1, "draws": 1}
+    return model.generate(batch, None, **{**settings, **changes})
+
+
+def test_twice_the_way_to_the_goal_doubles_the_movement():
+    model, data = trained()
+    batch = whole(data[[2]])
+    plain = generate(model, batch).location[0, 0]
+    posterior = model._demonstrated(batch, 1)[0].population.mean[0]
+    first, velocity, fitted = posterior[:, :3].T
+    assert (fitted - first).abs().min() > model.config.least_amplitude
+    goal = first + 2 * (fitted - first)
+    found = generate(model, batch, goal=goal[None]).location[0, 0]
+    free = roll_out(model.primitive, FRAMES, Timing(FRAMES - 1.0))[:, 1:2] * velocity
+    torch.testing.assert_close(found - first - free, 2 * (plain - first - free))
+
+
+def test_longer_duration_is_the_same_path_more_slowly():
+    model, data = trained()
+    fine = generate(model, whole(data[[0]]), duration=20.0).location[0, 0]
+    finer = generate(model, whole(data[[0]]), duration=40.0).location[0, 0]
+    assert fine.shape == (581, CHANNELS)
+    assert (finer[::2] - fine).abs().max() < 0.05 * fine.std()
+
+
+def test_switching_begins_with_one_movement_and_ends_with_the_other():
+    model, data = trained()
+    one, other = whole(data[[0]]), whole(data[[3]])
+    found = generate(model, one, onto=other, start=8, steps=4, duration=4.0).location[0, 0]
+    first = generate(model, one, duration=4.0).location[0, 0]
+    last = generate(model, other, duration=4.0).location[0, 0]
+    torch.testing.assert_close(found[:9], first[:9])
+    torch.testing.assert_close(found[-1], last[-1], rtol=0, atol=1e-3)
+    with pytest.raises(ValueError, match="switching from frame 28 over 5 frames does not fit"):
+        generate(model, one, onto=other, start=28, steps=5)
+
+
+def test_ragged_movements_with_missing_frames():
+    arrays = [movement(i, 26 + 2 * i, CHANNELS).numpy().copy() for i in range(5)]
+    for array in arrays:
+        array[5:9, 0] = np.nan
+    arrays[2][:, 1] = np.nan
+    data = Sequences.from_arrays(arrays, rate=30.0)
+    model = DMP(data.layout, Config(kernels=5))
+    model.condition(data)
+    found = model.forecast(whole(data[[0, 1, 3]].first(12)), None, horizon=10, draws=3)
+    assert found.location.shape == (16, 3, 10, CHANNELS)
+    assert found.draws.shape == (3, 3, 10, CHANNELS)
+    assert all(bool(torch.isfinite(t).all()) for t in (found.location, found.epistemic))
+
+
+@pytest.mark.parametrize("learning", ["path", "force", "lwr"])
+def test_every_way_of_learning_reconstructs(learning):
+    model, data = trained(learning=learning, gated=True)
+    found = model.reconstruct(whole(data), None, draws=1)
+    error = (found.location[0] - data.values).square().mean()
+    assert error < 0.2 * data.values.var()
+
+
+def test_rhythmic_movement_is_continued_from_any_phase():
+    time = np.arange(60)[:, None]
+    starts = np.random.default_rng(0).uniform(0, 2 * np.pi, 8)
+    arrays = [
+        np.concatenate(
+            [np.sin(2 * np.pi * time / 20 + s), np.cos(4 * np.pi * time / 20 + 2 * s)], 1
+        )
+        for s in starts
+    ]
+    data = Sequences.from_arrays(arrays, rate=30.0)
+    model = DMP(data.layout, Config(kind="rhythmic", kernels=8))
+    model.condition(data[slice(0, 7)])
+    assert period_of([(data.values[0], data.mask[0])]) == 20.0
+    found = model.forecast(whole(data[[7]].first(25)), None, horizon=35, draws=2)
+    error = (found.location.mean(0)[0] - data.values[7, 25:]).square().mean()
+    assert error < 0.05 * data.values.var()
+
+
+def test_errors_say_what_is_missing():
+    _, data = trained(count=1)
+    model = DMP(data.layout, Config(kernels=5))
+    with pytest.raises(NotFittedError, match="dmp has not been trained"):
+        model.forecast(whole(data.first(5)), None, horizon=3, draws=1)
+    with pytest.raises(ValueError, match="9 frames in a movement are too few for stable steps"):
+        model.condition(data.first(10))
+    with pytest.raises(ValueError, match="kernels must be at least 2; got 1"):
+        Config(kernels=1)
