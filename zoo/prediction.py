@@ -9,61 +9,15 @@ from statistics import NormalDist
 from typing import Any, Literal, Protocol, Self
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from zoo import mixtures
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
+from zoo.mixtures import Predictive
 
 __all__ = ["Prediction", "Predictive", "Recalibration"]
 
 Axes = tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Predictive:
-    r"""What a model returns: p(y) = 1/K Σ_k N(y; location_k, noise² + epistemic²).
-
-    ``location`` has a leading ``component`` axis (1 for a Gaussian or a deterministic model).
-    ``noise`` is the aleatoric standard deviation, broadcastable to ``location``; None says that
-    the model has none to give. ``epistemic`` is a further standard deviation of the mean where a
-    model knows it in closed form; the spread of the components counts as epistemic too.
-    ``joint`` says that each component is one joint trajectory; ``draws`` are joint draws of the
-    noise-free path where the moments themselves are exact.
-    """
-
-    location: Float[Tensor, "component *shape"]
-    noise: Tensor | None = None
-    epistemic: Tensor | None = None
-    joint: bool = False
-    draws: Float[Tensor, "sample *shape"] | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse parts that do not fit ``location``."""
-        shape = self.location.shape
-        if not shape or shape[0] < 1:
-            raise ValueError(f"location needs a component axis; it has shape {tuple(shape)}")
-        _check_broadcast("noise", self.noise, shape)
-        _check_broadcast("epistemic", self.epistemic, shape)
-        if self.draws is not None and (not len(self.draws) or self.draws.shape[1:] != shape[1:]):
-            got = tuple(self.draws.shape)
-            raise ValueError(f"draws have shape {got}; (sample, *{tuple(shape[1:])}) is needed")
-
-    @property
-    def spread(self) -> Tensor | None:
-        """Standard deviation of every component; None for draws without noise."""
-        parts = [part.square() for part in (self.noise, self.epistemic) if part is not None]
-        return sum(parts[1:], parts[0]).sqrt() if parts else None
-
-    def affine(self, scale: Tensor, shift: Tensor) -> Predictive:
-        """The same distribution of ``scale * y + shift`` (both broadcast over the last axis)."""
-        return Predictive(
-            location=self.location * scale + shift,
-            noise=None if self.noise is None else self.noise * scale.abs(),
-            epistemic=None if self.epistemic is None else self.epistemic * scale.abs(),
-            joint=self.joint,
-            draws=None if self.draws is None else self.draws * scale + shift,
-        )
 
 
 class Recalibration(Protocol):
@@ -321,13 +275,3 @@ def _with_noise(path: Tensor, noise: Tensor | None, generator: torch.Generator) 
     return path + noise * torch.randn(
         path.shape, generator=generator, dtype=path.dtype, device=path.device
     )
-
-
-def _check_broadcast(what: str, tensor: Tensor | None, shape: torch.Size) -> None:
-    if tensor is None:
-        return
-    padded = (1,) * (len(shape) - tensor.ndim) + tuple(tensor.shape)
-    if len(padded) != len(shape) or any(
-        a not in (1, b) for a, b in zip(padded, shape, strict=True)
-    ):
-        raise ValueError(f"{what} has shape {tuple(tensor.shape)}; location has {tuple(shape)}")

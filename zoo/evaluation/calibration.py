@@ -13,13 +13,20 @@ from statistics import NormalDist
 from typing import Any, ClassVar, Protocol, Self
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from zoo.errors import UnknownNameError
-from zoo.evaluation.answers import Answer, Groups, group_sums
+from zoo.evaluation.answers import Answer, Groups
 from zoo.evaluation.curve import Curve
 from zoo.evaluation.factors import By, Factors, crossed, standardised
+from zoo.evaluation.pool import (
+    LEVELS,
+    Pool,
+    look_up,
+    normal_level,
+    normal_score,
+    scores_of_draws,
+)
 from zoo.prediction import Prediction, Predictive, Recalibration
 
 __all__ = [
@@ -30,9 +37,6 @@ __all__ = [
     "recalibrate",
     "recalibration_from_state",
 ]
-
-_LEVELS = torch.arange(1, 100, dtype=torch.float64) / 100
-_NODES = 33
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,14 +89,13 @@ class Conformal:
 
     The score is \|y − μ\| / (σ b_c d_t), with factors fitted without the score's own group. q(p)
     is the smallest score that a share p (1 + 1/G_eff) of the scores does not exceed, each group
-    weighing the same. G_eff (``worth``), between the number of groups G and that of entries,
-    is what the groups are worth as independent entries: p (1 − p) over the squared standard error
-    of the groups' coverages, both summed over p = 50 %, …, 90 %. Where all entries of a group
-    stand or fall together G_eff = G, the hierarchical conformal quantile with its guarantee for a
-    new group; with one entry a group it is the usual split conformal quantile, (n + 1) p scores
-    out of n. Between the two the guarantee is approximate. ``reach`` is the widest level that the
-    groups support; beyond it q grows like a Gaussian's. The result is symmetric about the mean
-    and has no density.
+    weighing the same. G_eff (``worth``) is what the groups are worth as independent entries
+    (:class:`~zoo.evaluation.pool.Pool`). Where all entries of a group stand or fall together
+    G_eff = G, the hierarchical conformal quantile with its guarantee for a new group; with one
+    entry a group it is the usual split conformal quantile, (n + 1) p scores out of n. Between the
+    two the guarantee is approximate. ``reach`` is the widest level that the groups support;
+    beyond it q grows like a Gaussian's. The result is symmetric about the mean and has no
+    density.
     """
 
     kind: ClassVar[str] = "conformal"
@@ -107,22 +110,21 @@ class Conformal:
         """Factors from all groups, thresholds from scores of groups left out in turn."""
         sizes = standardised(answer).abs()
         scores = sizes / crossed(sizes, answer, by, 1, common=False)
-        pooled, weight = _weighted(scores, answer)
-        worth = _worth(pooled, weight, scores, answer)
-        corrected = _LEVELS * (1 + 1 / worth)
+        pool = Pool.of(scores, answer)
+        corrected = LEVELS * (1 + 1 / pool.independent)
         supported = corrected <= 1
         if not bool(supported.any()):
             raise ValueError(f"{answer.groups} groups are too few for any conformal interval")
         return cls(
             factors=Factors.fit(sizes, answer, by, 1, common=False),
             thresholds=Curve.through(
-                _score((1 + _LEVELS[supported]) / 2),
-                _weighted_quantile(pooled, weight, corrected[supported]),
+                normal_score((1 + LEVELS[supported]) / 2),
+                pool.quantile(corrected[supported]),
                 from_zero=True,
             ),
             groups=answer.groups,
-            worth=worth,
-            reach=float(_LEVELS[supported][-1]),
+            worth=pool.independent,
+            reach=float(LEVELS[supported][-1]),
         )
 
     def predictive(self, raw: Prediction) -> None:
@@ -138,11 +140,11 @@ class Conformal:
         """Level of the quantile that ``value`` is."""
         reduced = ((value - raw.mean) / self._spread(raw)).double()
         score = self.thresholds.inverse(reduced.abs()) * reduced.sign()
-        return _level(score).to(value)
+        return normal_level(score).to(value)
 
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Each draw moved to the corrected quantile of its own raw level."""
-        score = _scores_of_draws(raw, draws).double()
+        score = scores_of_draws(raw, draws).double()
         threshold = (self.thresholds(score.abs()) * score.sign()).to(draws)
         return raw.mean + threshold * self._spread(raw)
 
@@ -186,10 +188,10 @@ class Isotonic:
         factors = crossed(standardised(answer).square(), answer, by, 2).to(raw.mean)
         reduced = raw.mean + (answer.truth - raw.mean) / factors
         scores = torch.where(answer.mask, raw.normal_score(reduced).double(), 0.0)
-        pooled, weight = _weighted(scores, answer)
+        pool = Pool.of(scores, answer)
         return cls(
             scale=Scale.fit(answer, by),
-            levels=Curve.through(_score(_LEVELS), _weighted_quantile(pooled, weight, _LEVELS)),
+            levels=Curve.through(normal_score(LEVELS), pool.quantile(LEVELS)),
             groups=answer.groups,
         )
 
@@ -205,13 +207,13 @@ class Isotonic:
         """Observed frequency of the stretched mixture's level."""
         reduced = raw.mean + (value - raw.mean) / self.scale.factors.of(raw)
         score = self.levels.inverse(raw.normal_score(reduced).double())
-        return _level(score).to(value)
+        return normal_level(score).to(value)
 
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Each draw moved to the corrected quantile of its own raw level."""
-        score = self.levels(_scores_of_draws(raw, draws).double()).to(draws)
+        score = self.levels(scores_of_draws(raw, draws).double()).to(draws)
         knots = torch.stack([raw.quantile_at(s / 2) for s in range(-8, 9)])
-        return self.scale.transport(raw, _read(knots, 2 * score + 8))
+        return self.scale.transport(raw, look_up(knots, 2 * score + 8))
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
@@ -286,59 +288,3 @@ def _stretched(p: Predictive, factor: Tensor) -> Predictive:
         epistemic=None if p.epistemic is None else p.epistemic * factor,
         draws=None if p.draws is None else mean + factor * (p.draws - mean),
     )
-
-
-def _scores_of_draws(raw: Prediction, draws: Tensor) -> Tensor:
-    """Normal scores of many draws; of a mixture, read off 33 nodes between its extreme draws."""
-    if raw.predictive.location.shape[0] == 1 or len(draws) <= _NODES:
-        return raw.normal_score(draws)
-    low, high = draws.amin(0), draws.amax(0)
-    share = torch.linspace(0, 1, _NODES).to(draws).view(-1, *[1] * low.ndim)
-    nodes = raw.normal_score(torch.lerp(low, high, share))
-    return _read(nodes, (draws - low) / (high - low).clamp(min=1e-30) * (_NODES - 1))
-
-
-def _read(table: Tensor, place: Tensor) -> Tensor:
-    """Heights of a table along its first axis at fractional rows; end pieces are continued."""
-    below = place.floor().clamp(0, len(table) - 2)
-    low, high = table.gather(0, below.long()), table.gather(0, below.long() + 1)
-    return torch.lerp(low, high, place - below)
-
-
-def _score(levels: Tensor) -> Tensor:
-    scores: Tensor = torch.special.ndtri(levels)
-    return scores
-
-
-def _level(scores: Tensor) -> Tensor:
-    levels: Tensor = torch.special.ndtr(scores)
-    return levels
-
-
-def _weighted(scores: Tensor, answer: Answer) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Known scores in ascending order and the share of the scores that ends with each."""
-    counts = group_sums(answer.mask.flatten(1).sum(1), answer.cluster)
-    weight = 1 / (answer.groups * counts[answer.cluster])
-    weight = weight.view(-1, *[1] * (scores.ndim - 1)).expand_as(scores)
-    ordered, place = scores[answer.mask].sort()
-    return ordered, weight[answer.mask][place].cumsum(0)
-
-
-def _weighted_quantile(ordered: Tensor, share: Tensor, levels: Tensor) -> Tensor:
-    """Smallest score at which the share reaches each level."""
-    place = torch.searchsorted(share, levels.to(share) - 1e-9)
-    return ordered[place.clamp(max=len(ordered) - 1)]
-
-
-def _worth(pooled: Tensor, share: Tensor, scores: Tensor, answer: Answer) -> float:
-    """G_eff: independent entries that give coverages as certain as these groups do."""
-    counts = group_sums(answer.mask.flatten(1).sum(1), answer.cluster)
-    present = counts > 0
-    levels = _LEVELS[49:90].to(scores)
-    variance = torch.zeros_like(levels)
-    for i, threshold in enumerate(_weighted_quantile(pooled, share, levels)):
-        inside = ((scores <= threshold) & answer.mask).flatten(1).sum(1)
-        coverage = group_sums(inside, answer.cluster)[present] / counts[present]
-        variance[i] = coverage.var() / answer.groups
-    worth = (levels * (1 - levels)).sum() / variance.sum()
-    return float(worth.clamp(answer.groups, float(counts.sum())))
