@@ -21,20 +21,24 @@ from zoo.types import Batch, Layout
 
 __all__ = ["Config", "LatentDmp"]
 
+ALPHA, ALPHA_FRAME = 25.0, 0.4
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """``latent_dim`` d', ``hidden`` decoder units, ``kernels`` of the forcing term, α (β = α/4).
 
-    ``w_scale`` and ``velocity_scale`` are the prior standard deviations of w and ż_1, in units of
-    the acceleration αβ and of the movement's length; ``noise_scale`` is where w_ε starts, in the
-    same unit as w; ``output_std`` where the constant output spread starts, in scaled units.
+    None for α is 25 a movement, or 0.4 a frame for movements under 64 frames, whose Euler steps
+    would else be unstable. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
+    w and ż_1, in units of the acceleration αβ and of the movement's length; ``noise_scale`` is
+    where w_ε starts, in the same unit as w; ``output_std`` where the constant output spread
+    starts, in scaled units, never below ``output_floor``.
     """
 
     latent_dim: int = 5
     hidden: int = 200
     kernels: int = 50
-    alpha: float = 25.0
+    alpha: float | None = None
     transition_hidden: int = 32
     w_scale: float = 3.0
     velocity_scale: float = 10.0
@@ -50,7 +54,7 @@ class Config:
         if self.kernels < 2:
             raise ValueError(f"kernels must be at least 2; got {self.kernels}")
         for name in ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std"):
-            if not getattr(self, name) > 0:
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
 
 
@@ -70,7 +74,7 @@ class LatentDmp(nn.Module):
         self.config, self.frames = config, _frames(layout)
         self.latent_dim, self.kernels = config.latent_dim, config.kernels
         channels, latent = len(layout.channels), config.latent_dim
-        self.system = Transformation(config.alpha, config.alpha / 4, 1.0, 1 / (self.frames - 1))
+        self.system = _system(config.alpha, self.frames)
         self.decoder = mlp([latent, config.hidden, channels])
         self.g = mlp([latent, config.transition_hidden, latent], "tanh")
         nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
@@ -154,6 +158,18 @@ class LatentDmp(nn.Module):
         time = torch.arange(steps, dtype=torch.float64)
         whole = (self.frames - 1) * duration
         return discrete_basis(time, kernels=self.kernels, duration=whole)
+
+
+def _system(alpha: float | None, frames: int) -> Transformation:
+    """The critically damped system, a movement long in its unit of time."""
+    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
+    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
+    if not system.stable:
+        raise ValueError(
+            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
+            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
+        )
+    return system
 
 
 def _frames(layout: Layout) -> int:
