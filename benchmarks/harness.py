@@ -18,6 +18,7 @@ __all__ = ["interleave", "ratio", "report", "store", "versions"]
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 LIBRARIES = ("movezoo", "torch", "pyro-ppl", "numpy")
+FILL = 5e-3
 _STARTED = time.monotonic()
 
 Timings = dict[str, dict[str, float]]
@@ -29,7 +30,7 @@ def interleave(
     """Seconds a call of every callable, timed in turn so that a busy machine slows all alike.
 
     Every round runs each callable once, in an order that rotates from round to round. Callables
-    that take less than a millisecond are repeated within a round until they fill one.
+    that take less than five milliseconds are repeated within a round until they fill them.
 
     >>> timings = interleave({"sum": lambda: sum(range(100))}, rounds=3)
     >>> sorted(timings["sum"])
@@ -117,7 +118,7 @@ def versions(*libraries: str) -> dict[str, str]:
 
 
 def _repeats(call: Callable[[], object]) -> int:
-    return max(1, round(1e-3 / max(_seconds(call, 1), 1e-7)))
+    return max(1, round(FILL / max(_seconds(call, 1), 1e-7)))
 
 
 def _seconds(call: Callable[[], object], repeats: int) -> float:

@@ -84,10 +84,7 @@ def ridge_regression(
     penalty: float = 0.0,
 ) -> Float[Tensor, "kernel channel"]:
     """Weights that minimise ‖target − design w‖² + penalty ‖w‖², all kernels at once (63)."""
-    gram = design.mT @ design
-    if penalty:
-        gram = gram + penalty * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-    return torch.cholesky_solve(design.mT @ target, torch.linalg.cholesky(gram))
+    return torch.cholesky_solve(design.mT @ target, torch.linalg.cholesky(_gram(design, penalty)))
 
 
 def fit_matrix(
@@ -95,16 +92,18 @@ def fit_matrix(
 ) -> Float[Tensor, "kernel time"]:
     """S with w = S y: ridge regression on the central target force of a movement y.
 
-    Both are linear in the demonstration; the goal is its last frame. Fitting any number of
-    movements of this length is one product.
+    Both are linear in the demonstration, the goal is its last frame: S is the adjoint of
+    :func:`central_target_force` applied to the design. Fitting any number of movements of this
+    length is one product.
     """
-    pull = torch.func.vjp(
-        lambda y: central_target_force(y, y[-1], system), torch.zeros_like(design)
-    )[1]
-    gram = design.mT @ design
-    if penalty:
-        gram = gram + penalty * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-    return torch.cholesky_solve(pull(design)[0].mT, torch.linalg.cholesky(gram))
+    rate = design.clone()
+    rate[-1] = 0
+    velocity = _central_adjoint(rate, system.dt)
+    velocity[-1] = 0
+    rate = rate.mul_(system.alpha * system.tau).add_(velocity, alpha=system.tau**2)
+    pulled = system.stiffness * design + _central_adjoint(rate, system.dt)
+    pulled[-1] -= system.stiffness * design.sum(0)
+    return torch.cholesky_solve(pulled.mT, torch.linalg.cholesky(_gram(design, penalty)))
 
 
 def trajectory_matrix(
@@ -147,3 +146,23 @@ def _central(values: Tensor, dt: float) -> Tensor:
     first = (values[..., 1:2, :] - values[..., :1, :]) / dt
     last = (values[..., -1:, :] - values[..., -2:-1, :]) / dt
     return torch.cat([first, inner, last], dim=-2)
+
+
+def _central_adjoint(values: Tensor, dt: float) -> Tensor:
+    """The transpose of :func:`_central`."""
+    half = values[1:-1] / (2 * dt)
+    out = torch.zeros_like(values)
+    out[2:] += half
+    out[:-2] -= half
+    out[0] -= values[0] / dt
+    out[1] += values[0] / dt
+    out[-2] -= values[-1] / dt
+    out[-1] += values[-1] / dt
+    return out
+
+
+def _gram(design: Tensor, penalty: float) -> Tensor:
+    gram = design.mT @ design
+    if not penalty:
+        return gram
+    return gram + penalty * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
