@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import torch
 
-__all__ = ["interleave", "ratio", "report", "store", "versions"]
+__all__ = ["Timings", "interleave", "ratio", "report", "store", "versions"]
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 LIBRARIES = ("movezoo", "torch", "pyro-ppl", "numpy")
@@ -29,19 +29,22 @@ def interleave(
 ) -> Timings:
     """Seconds a call of every callable, timed in turn so that a busy machine slows all alike.
 
+    ``processor_median`` counts only the time that this thread computed: on a busy machine the
+    steadier measure of single-threaded work.
+
     Every round runs each callable once, in an order that rotates from round to round. Callables
     that take less than five milliseconds are repeated within a round until they fill them.
 
     >>> timings = interleave({"sum": lambda: sum(range(100))}, rounds=3)
     >>> sorted(timings["sum"])
-    ['best', 'lower_quartile', 'median', 'repeats', 'rounds', 'upper_quartile']
+    ['best', 'lower_quartile', 'median', 'processor_median', 'repeats', 'rounds', 'upper_quartile']
     """
     names = list(callables)
     for _ in range(warmup):
         for name in names:
             callables[name]()
     repeats = {name: _repeats(callables[name]) for name in names}
-    seconds: dict[str, list[float]] = {name: [] for name in names}
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     for turn in range(rounds):
         shift = turn % len(names)
         for name in names[shift:] + names[:shift]:
@@ -49,13 +52,13 @@ def interleave(
     return {name: _summary(seconds[name], repeats[name]) for name in names}
 
 
-def ratio(timings: Timings, slow: str, fast: str) -> float:
+def ratio(timings: Timings, slow: str, fast: str, *, measure: str = "median") -> float:
     """How many times longer the median call of ``slow`` takes than that of ``fast``.
 
     >>> ratio({"loop": {"median": 2.0}, "product": {"median": 0.5}}, "loop", "product")
     4.0
     """
-    return timings[slow]["median"] / timings[fast]["median"]
+    return timings[slow][measure] / timings[fast][measure]
 
 
 def report(title: str, timings: Timings) -> None:
@@ -118,23 +121,25 @@ def versions(*libraries: str) -> dict[str, str]:
 
 
 def _repeats(call: Callable[[], object]) -> int:
-    return max(1, round(FILL / max(_seconds(call, 1), 1e-7)))
+    return max(1, round(FILL / max(_seconds(call, 1)[0], 1e-7)))
 
 
-def _seconds(call: Callable[[], object], repeats: int) -> float:
-    begin = time.perf_counter()
+def _seconds(call: Callable[[], object], repeats: int) -> tuple[float, float]:
+    begin, busy = time.perf_counter(), time.thread_time()
     for _ in range(repeats):
         call()
-    return (time.perf_counter() - begin) / repeats
+    return (time.perf_counter() - begin) / repeats, (time.thread_time() - busy) / repeats
 
 
-def _summary(seconds: list[float], repeats: int) -> dict[str, float]:
-    lower, middle, upper = statistics.quantiles(seconds, n=4, method="inclusive")
+def _summary(seconds: list[tuple[float, float]], repeats: int) -> dict[str, float]:
+    elapsed = [wall for wall, _ in seconds]
+    lower, middle, upper = statistics.quantiles(elapsed, n=4, method="inclusive")
     return {
         "median": middle,
         "lower_quartile": lower,
         "upper_quartile": upper,
-        "best": min(seconds),
+        "best": min(elapsed),
+        "processor_median": statistics.median(busy for _, busy in seconds),
         "rounds": len(seconds),
         "repeats": repeats,
     }
