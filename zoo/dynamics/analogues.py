@@ -66,6 +66,7 @@ def sums_of_squares(x: Tensor, m: Tensor, y: Tensor, n: Tensor) -> tuple[Tensor,
 
 
 def mean_square(x: Tensor, m: Tensor, y: Tensor, n: Tensor) -> Tensor:
+    """Mean square of each candidate over the seen entries of its frames and channels."""
     square, both = sums_of_squares(x, m, y, n)
     return torch.where(both > 0, square / both.clamp(min=1), torch.finfo(x.dtype).max)
 
