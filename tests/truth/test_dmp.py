@@ -19,9 +19,9 @@ from zoo.dynamics.imitation import (
     target_force,
     trajectory_matrix,
 )
-from zoo.dynamics.learning import period_of
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Timing, path_noise, roll_out
+from zoo.dynamics.timing import period_of
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded

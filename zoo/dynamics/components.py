@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["Components", "Paths", "resample"]
+__all__ = ["Components", "Paths", "alike", "ramp", "resample"]
 
 
 @dataclass(frozen=True)
@@ -78,3 +79,20 @@ def resample(
     points = (torch.arange(count, dtype=below.dtype, device=below.device) + 0.5) / count
     found = torch.searchsorted(below, points.expand(len(below), -1).contiguous())
     return found.clamp(max=len(log_weight) - 1).T
+
+
+def alike(seen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Rows of the movements that have the same entries, with these."""
+    patterns, index = torch.unique(seen.flatten(1), dim=0, return_inverse=True)
+    for i, pattern in enumerate(patterns):
+        yield (index == i).nonzero()[:, 0], pattern.view(seen.shape[1:])
+
+
+def ramp(frames: int, start: int, steps: int) -> Float[Tensor, " step"]:
+    """Share of the movement switched to: 0 until ``start``, 1 from ``start + steps``."""
+    if start < 0 or steps < 1 or start + steps > frames - 1:
+        raise ValueError(
+            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
+        )
+    time = torch.arange(frames - 1, dtype=torch.float64)
+    return ((time - start) / steps).clamp(0, 1)

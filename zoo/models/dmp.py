@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.datasets.records import Sequences
-from zoo.dynamics.components import Components, Paths, resample
+from zoo.dynamics.components import Components, Paths, alike, ramp, resample
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.imitation import trajectory_matrix
-from zoo.dynamics.learning import Learning, learn, phases
+from zoo.dynamics.learning import Learning, learn
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Primitive, Sight, Timing, path_noise, roll_out, sight
+from zoo.dynamics.timing import phases
 from zoo.errors import NotFittedError
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -217,7 +218,7 @@ class DMP(nn.Module):
         self._check_fitted()
         frames = round((batch.values.shape[1] - 1) * duration) + 1
         other = None if onto is None else self._demonstrated(onto, len(batch))
-        blend = _ramp(frames, start, steps) if other else torch.zeros(frames - 1, dtype=self.dtype)
+        blend = ramp(frames, start, steps) if other else torch.zeros(frames - 1, dtype=self.dtype)
 
         def mix(i: int, case: Case) -> Paths:
             timing = Timing(case.timing.unit * duration, case.timing.offset)
@@ -257,7 +258,7 @@ class DMP(nn.Module):
         """
         self._check_fitted()
         parts = Components.empty(count, draws, values)
-        for rows, mask in _alike(seen):
+        for rows, mask in alike(seen):
             x = values[rows] * mask
             views = [self._sight(mask, timing) for timing in timings]
             evidence = torch.stack([self._evidence(view, x) for view in views])
@@ -376,13 +377,6 @@ def _seen(batch: Batch) -> Bool[Tensor, "sequence time channel"]:
     return batch.mask
 
 
-def _alike(seen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Rows of the movements that have the same entries, with these."""
-    patterns, index = torch.unique(seen.flatten(1), dim=0, return_inverse=True)
-    for i, pattern in enumerate(patterns):
-        yield (index == i).nonzero()[:, 0], pattern.view(seen.shape[1:])
-
-
 def _hypotheses(kind: str, timings: Sequence[Timing]) -> list[Timing]:
     """Timings that a new movement may have: durations seen, or all phases of the period."""
     if kind == "rhythmic":
@@ -392,13 +386,3 @@ def _hypotheses(kind: str, timings: Sequence[Timing]) -> list[Timing]:
         ranks = torch.linspace(0, len(units) - 1, COMPONENTS).round().int().tolist()
         units = [units[rank] for rank in ranks]
     return [Timing(unit) for unit in units]
-
-
-def _ramp(frames: int, start: int, steps: int) -> Float[Tensor, " step"]:
-    """Share of the movement switched to: 0 until ``start``, 1 from ``start + steps``."""
-    if start < 0 or steps < 1 or start + steps > frames - 1:
-        raise ValueError(
-            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
-        )
-    time = torch.arange(frames - 1, dtype=torch.float64)
-    return ((time - start) / steps).clamp(0, 1)
