@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from zoo.errors import DamagedRunError
 
-__all__ = ["read", "replace_file", "restore", "state_of", "write"]
+__all__ = ["clear", "exists", "read", "replace_file", "restore", "state_of", "write"]
 
 
 def write(
@@ -34,13 +34,14 @@ def write(
 ) -> None:
     """Write ``stem.json`` and its tensors into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    payload = save_tensors({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()})
-    digest = hashlib.sha256(payload).hexdigest()
+    content = save_tensors({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()})
+    digest = hashlib.sha256(content).hexdigest()
     name = f"{stem}-{digest[:16]}.safetensors"
     head = {"format": f"movezoo-{stem}", "version": version, "tensors": name, "sha256": digest}
-    text = json.dumps({**head, **meta}, indent=1, allow_nan=False)
-    replace_file(folder / name, payload)
-    replace_file(folder / f"{stem}.json", text.encode())
+    body = {**head, **meta}
+    replace_file(folder / name, content)
+    sealed = json.dumps({**body, "seal": _seal(body)}, indent=1, allow_nan=False)
+    replace_file(folder / f"{stem}.json", sealed.encode())
     for old in folder.glob(f"{stem}-*.safetensors"):
         if old.name != name:
             old.unlink(missing_ok=True)
@@ -48,27 +49,40 @@ def write(
 
 def read(folder: Path, stem: str, *, version: int) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read what :func:`write` wrote; a damaged, foreign or newer folder is refused."""
-    meta = _meta(folder / f"{stem}.json", stem, version)
+    meta = _opened(folder / f"{stem}.json", stem, version)
     file = folder / Path(str(meta.get("tensors"))).name
-    if not file.is_file():
-        raise DamagedRunError(f"{folder}: {file.name} is missing")
-    payload = file.read_bytes()
-    if hashlib.sha256(payload).hexdigest() != meta.get("sha256"):
-        raise DamagedRunError(f"{file}: the hash differs from the one in {stem}.json")
     try:
-        return meta, load_tensors(payload)
+        content = file.read_bytes()
+    except OSError as error:
+        raise DamagedRunError(f"{file}: the tensors are missing or unreadable: {error}") from None
+    if hashlib.sha256(content).hexdigest() != meta.get("sha256"):
+        raise DamagedRunError(f"{file}: the tensors are damaged: their hash is not the one kept")
+    try:
+        return meta, load_tensors(content)
     except SafetensorError as error:
         raise DamagedRunError(f"{file}: not a safetensors file: {error}") from None
 
 
+def exists(folder: Path, stem: str) -> bool:
+    """Whether ``folder`` holds one."""
+    return (folder / f"{stem}.json").exists()
+
+
+def clear(folder: Path, stem: str) -> None:
+    """Remove it from ``folder``, its index first."""
+    (folder / f"{stem}.json").unlink(missing_ok=True)
+    for path in folder.glob(f"{stem}-*.safetensors"):
+        path.unlink(missing_ok=True)
+
+
 def replace_file(path: Path, content: bytes) -> None:
-    """Put ``content`` at ``path`` in one step that survives a crash."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    with open(partial, "wb") as file:
+    """Put ``content`` at ``path`` in one step that is on the disk when this returns."""
+    part = path.with_name(f"{path.name}.part")
+    with part.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(partial, path)
+    os.replace(part, path)
     directory = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(directory)
@@ -115,17 +129,23 @@ def _put(module: nn.Module, key: str, value: Tensor, trainable: bool) -> None:
             owner._buffers[name] = value
 
 
-def _meta(path: Path, stem: str, version: int) -> dict[str, Any]:
-    if not path.is_file():
-        raise DamagedRunError(f"{path.parent} holds no {path.name}: it is not a movezoo {stem}")
+def _seal(body: Mapping[str, Any]) -> str:
+    text = json.dumps(body, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _opened(index: Path, stem: str, version: int) -> dict[str, Any]:
+    if not index.is_file():
+        raise DamagedRunError(f"{index.parent} holds no {index.name}: it is not a movezoo {stem}")
     try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DamagedRunError(f"{path}: not JSON: {error}") from None
-    if not isinstance(meta, dict) or meta.get("format") != f"movezoo-{stem}":
-        raise DamagedRunError(f"{path} is not a movezoo {stem}")
-    if meta.get("version") != version:
-        raise DamagedRunError(
-            f"{path} has format version {meta.get('version')}; this movezoo reads {version}"
-        )
-    return meta
+        body: dict[str, Any] = json.loads(index.read_bytes())
+        kind, found, seal = body["format"], body["version"], body.pop("seal", None)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DamagedRunError(f"{index}: not a readable {stem}: {error!r}") from None
+    if kind != f"movezoo-{stem}":
+        raise DamagedRunError(f"{index}: format is {kind!r}; 'movezoo-{stem}' is needed")
+    if found != version:
+        raise DamagedRunError(f"{index}: format version {found}; this movezoo reads {version}")
+    if seal != _seal(body):
+        raise DamagedRunError(f"{index}: the index is damaged (its seal differs)")
+    return body

@@ -2,82 +2,43 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from zoo import archive
 from zoo.errors import DamagedRunError
 
-__all__ = ["capture", "clear", "difference", "exists", "read", "restore", "write", "write_file"]
+__all__ = ["capture", "clear", "difference", "exists", "read", "restore", "write"]
 
-FORMAT = "movezoo-checkpoint"
 VERSION = 1
-_INDEX = "checkpoint.json"
-_TENSORS = "checkpoint-*.safetensors"
+_STEM = "checkpoint"
 
 Tensors = dict[str, Tensor]
 
 
 def write(folder: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any]) -> None:
-    """Store ``tensors`` and the JSON ``state``; the last checkpoint stays until this one is whole.
-
-    The tensors go to a file named by its content, then the index is replaced: a reader finds
-    either the old checkpoint or the new one.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    content = save({k: v.detach().cpu().clone() for k, v in tensors.items()})
-    digest = hashlib.sha256(content).hexdigest()
-    name = _TENSORS.replace("*", digest[:16])
-    write_file(folder / name, content)
-    body = {"format": FORMAT, "version": VERSION, "tensors": name, "sha256": digest, "state": state}
-    write_file(folder / _INDEX, _sealed(body).encode())
-    for old in folder.glob(_TENSORS):
-        if old.name != name:
-            old.unlink(missing_ok=True)
+    """Store ``tensors`` and ``state``; the last checkpoint stays until this one is whole."""
+    archive.write(folder, _STEM, {"state": state}, tensors, version=VERSION)
 
 
 def read(folder: Path) -> tuple[Tensors, dict[str, Any]]:
     """Tensors and state of the checkpoint; what is not whole and ours is a DamagedRunError."""
-    index = folder / _INDEX
-    body = _opened(index)
-    path = folder / str(body["tensors"])
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DamagedRunError(f"{path}: the checkpoint's tensors cannot be read: {error}") from None
-    if hashlib.sha256(content).hexdigest() != body["sha256"]:
-        raise DamagedRunError(f"{path}: the tensors are damaged (their SHA-256 differs)")
-    return load(content), body["state"]
+    body, tensors = archive.read(folder, _STEM, version=VERSION)
+    return tensors, body["state"]
 
 
 def exists(folder: Path) -> bool:
     """Whether ``folder`` holds a checkpoint."""
-    return (folder / _INDEX).exists()
+    return archive.exists(folder, _STEM)
 
 
 def clear(folder: Path) -> None:
     """Remove the checkpoint of ``folder``, its index first."""
-    (folder / _INDEX).unlink(missing_ok=True)
-    for path in folder.glob(_TENSORS):
-        path.unlink(missing_ok=True)
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Replace a file in one step that is on the disk when this returns."""
-    part = path.with_name(f"{path.name}.part")
-    with part.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
-    _sync_folder(path.parent)
+    archive.clear(folder, _STEM)
 
 
 def difference(saved: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
@@ -130,35 +91,3 @@ def _restore_optimizer(optimizer: torch.optim.Optimizer, kept: Tensors) -> None:
         slots.setdefault(int(index), {})[key] = value.clone()
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": slots, "param_groups": groups})
-
-
-def _sealed(body: dict[str, Any]) -> str:
-    return json.dumps({**body, "seal": _seal(body)}, allow_nan=False)
-
-
-def _seal(body: Mapping[str, Any]) -> str:
-    text = json.dumps(body, sort_keys=True, allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _opened(index: Path) -> dict[str, Any]:
-    try:
-        body: dict[str, Any] = json.loads(index.read_bytes())
-        kind, version, seal = body["format"], body["version"], body.pop("seal", None)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise DamagedRunError(f"{index}: not a readable checkpoint: {error!r}") from None
-    if kind != FORMAT:
-        raise DamagedRunError(f"{index}: format is {kind!r}; {FORMAT!r} is needed")
-    if version != VERSION:
-        raise DamagedRunError(f"{index}: format version {version}; this movezoo reads {VERSION}")
-    if seal != _seal(body):
-        raise DamagedRunError(f"{index}: the index is damaged (its seal differs)")
-    return body
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

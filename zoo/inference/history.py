@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from zoo.inference.checkpoint import write_file
+from zoo.archive import replace_file
 
 __all__ = ["History", "Log", "Row"]
 
@@ -73,7 +73,7 @@ class Log:
             self._board = _board(self._events, len(history))
         if self._path is not None:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_file(self._path, "".join(map(_line, history)).encode())
+            replace_file(self._path, "".join(map(_line, history)).encode())
 
     def add(self, row: Row) -> None:
         """Append one row."""
