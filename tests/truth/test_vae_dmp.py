@@ -373,6 +373,23 @@ def test_prior_of_movements_holds_the_paths_of_the_response():
         torch.testing.assert_close(model._prior(FRAMES).paths, model.path(*args, batch))
 
 
+def test_a_section_is_imputed_alike_by_one_factorisation_and_by_one_for_each_movement():
+    torch.manual_seed(7)
+    data = movements()
+    model, guide = build(data)
+    batch, posterior = whole(data), GuidePosterior(guide)
+    with torch.no_grad():
+        model.learn_prior(batch, posterior)
+        mask = torch.ones(batch.values.shape, dtype=torch.bool)
+        mask[:, 4:7] = False
+        shared = model._conditioned(replace(batch, mask=mask), posterior, FRAMES)
+        other = torch.cat([mask, torch.ones_like(mask[:1])])
+        four = {n: torch.cat([getattr(batch, n), getattr(batch, n)[:1]]) for n in ("values",)}
+        each = model._conditioned(replace(batch, mask=other, **four), posterior, FRAMES)
+        torch.testing.assert_close(shared.means, each.means[:3], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(shared.covariance, each.covariance[0], rtol=1e-3, atol=1e-4)
+
+
 def test_goal_change_ends_at_the_goal_and_none_is_the_demonstration():
     torch.manual_seed(6)
     data = movements(2)

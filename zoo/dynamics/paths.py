@@ -190,7 +190,6 @@ def _block_diagonal(
 
 
 def _cholesky(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
-    scale = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
-    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
-    factor: Tensor = torch.linalg.cholesky((matrix + matrix.mT) / 2 + JITTER * scale * eye)
+    relative = 1 + JITTER * torch.eye(matrix.shape[-1], dtype=matrix.dtype)
+    factor: Tensor = torch.linalg.cholesky((matrix + matrix.mT) / 2 * relative)
     return factor

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from zoo.dynamics.dmp import Response
@@ -227,7 +227,9 @@ class VaeDmp(LatentDmp):
         where = torch.arange(length) < seen
         y = self.embed(posterior.encode(batch.values).mean)
         extra = None
-        if batch.mask is not None:
+        if batch.mask is not None and _is_one_section(batch.mask):
+            where[:seen] = batch.mask[0, :, 0]
+        elif batch.mask is not None:
             y, extra = self._encoded(batch.values, batch.mask, y, posterior)
             extra = nn.functional.pad(extra.double(), (0, 0, 0, 0, 0, length - seen))
         return prior.condition(
@@ -277,6 +279,11 @@ def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row la
 
 def _shape(prior: PathPrior | type[PathPrior]) -> list[float]:
     return [prior.bandwidth, prior.shrinkage, prior.process]
+
+
+def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
+    """Whether only whole frames are missing, the same of every movement."""
+    return bool((mask == mask[:1, :, :1]).all())
 
 
 def _frames_seen(batch: Batch) -> Tensor:
