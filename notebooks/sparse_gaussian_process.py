@@ -29,7 +29,7 @@ rng = np.random.default_rng(0)
 pressure = np.sort(rng.uniform(0, 10, 300))
 truth = lambda x: 4 * np.tanh((x - 2) / 2) + 0.8 * np.sin(2 * x)  # noqa: E731
 force = truth(pressure) + rng.normal(scale=0.4, size=300)
-gap = (pressure > 6.2) & (pressure < 7.4)
+gap = (pressure > 5.0) & (pressure < 7.8)
 data = zoo.Pairs.from_arrays(
     pressure[~gap, None], force[~gap], features=["pressure"], channels=["f_z"], units="N"
 )
@@ -72,7 +72,7 @@ plt.figure(figsize=(7, 3), layout="constrained")
 plt.plot(grid[:, 0], prediction.aleatoric[:, 0], label="aleatoric")
 plt.plot(grid[:, 0], prediction.epistemic[:, 0], label="epistemic")
 plt.plot(grid[:, 0], prediction.std[:, 0], "k:", label="together")
-plt.axvspan(6.2, 7.4, color="0.92")
+plt.axvspan(5.0, 7.8, color="0.92")
 plt.xlabel("pressure / a.u.")
 plt.ylabel("standard deviation / N")
 plt.legend(frameon=False)
