@@ -56,7 +56,7 @@ zoo.list_models(can="forecast")
 # learned force. `zoo.create` binds the entry to our data; unknown settings are refused by name.
 
 # %%
-model = zoo.create("vae-dmp", train, latent_dim=3, epochs=150)
+model = zoo.create("vae-dmp", train, latent_dim=3, max_steps=3000)
 run = zoo.fit(model, train, val=val)
 
 figure = plt.figure(figsize=(9, 3), layout="constrained")

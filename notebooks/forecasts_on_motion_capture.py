@@ -16,7 +16,8 @@
 #
 # A walk is seen for a moment; how does it go on, and how sure can we be? This notebook trains
 # VAE-DMP on real walks (CMU subject 35) when `MOVEZOO_DATA` names a folder with them, and on the
-# simulated robot arm otherwise, so that it runs everywhere. It then asks the one question that a
+# simulated robot arm otherwise, so that it runs everywhere. The walks are cut into windows of 70
+# frames at 60 Hz, so that a forecast may start at any moment of a step. The notebook then asks the one question that a
 # band must answer: *does 90 % of the truth fall into the 90 % band, on movements never seen?*
 
 # %%
@@ -30,8 +31,12 @@ import zoo
 from zoo.evaluation.figures import forecast_bands, reliability
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
-data = zoo.load_data("cmu-mocap/35-walk" if real else "robot-arm/reaching")
-train, val, calib, test = data.split(by="trial", parts=(0.5, 0.1, 0.2, 0.2), seed=1)
+if real:
+    walks = zoo.load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
+    data = walks.windows(70, stride=10)
+else:
+    data = zoo.load_data("robot-arm/reaching")
+train, val, calib, test = data.split(by="trial", parts=(0.5, 0.1, 0.2, 0.2), seed=0)
 seen, horizon = 10, 60
 
 plt.figure(figsize=(9, 3), layout="constrained")
@@ -42,7 +47,7 @@ for movement in data.values[:12]:
 plt.axvspan(0, seen / data.rate, color="0.9", label="seen by the forecast")
 plt.xlabel("time / s")
 plt.ylabel("angle / °")
-plt.title(f"{data.channels[joint]} in {min(12, len(data))} movements of {data.name}")
+plt.title(f"{data.channels[joint]} in {min(12, len(data))} windows of {data.name}")
 plt.legend(frameon=False)
 plt.show()
 
@@ -54,7 +59,7 @@ plt.show()
 # joint futures are drawn and decoded.
 
 # %%
-run = zoo.fit(zoo.create("vae-dmp", train, latent_dim=5, epochs=300), train, val=val)
+run = zoo.fit(zoo.create("vae-dmp", train, latent_dim=5, max_steps=4000), train, val=val)
 prediction = run.forecast(test.first(seen), horizon=horizon)
 forecast_bands(prediction, test.values, seen=seen)
 

@@ -16,14 +16,18 @@ from zoo.workflow import forecast_figure, reliability_figure
 
 __all__ = ["main"]
 
-SHARES = (0.55, 0.1, 0.2, 0.15)
+SHARES = (0.5, 0.1, 0.2, 0.2)
+STEPS = 6000
 
 
 def demo_data() -> Sequences:
-    """Real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm."""
+    """Real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm.
+
+    The walks are cut into windows of 70 frames at 60 Hz, a little more than a step each.
+    """
     if os.environ.get("MOVEZOO_DATA"):
-        walks: Sequences = load_data("cmu-mocap/35-walk")
-        return walks
+        walks: Sequences = load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
+        return walks.windows(70, stride=10)
     arm: Sequences = load_data("robot-arm/reaching")
     return arm
 
@@ -37,7 +41,8 @@ def main(folder: Path = Path("demo")) -> int:
         f"[bold]{data.name}[/] ({data.provenance}): {len(train)} movements to train on, "
         f"{len(val)} to validate, {len(calib)} to calibrate, {len(test)} never seen"
     )
-    run = fit(create("vae-dmp", train), train, val=val, run_dir=folder / "run", progress=True)
+    assembly = create("vae-dmp", train, max_steps=STEPS)
+    run = fit(assembly, train, val=val, run_dir=folder / "run", progress=True)
     run.calibrate(calib)
     run.save(folder / "run")
     table = evaluate(run, test, tasks=["forecast", "reconstruct"])
