@@ -18,7 +18,8 @@
 # VAE-DMP on real walks (CMU subject 35) when `MOVEZOO_DATA` names a folder with them, and on the
 # simulated robot arm otherwise, so that it runs everywhere. The walks are cut into windows of 70
 # frames at 60 Hz, so that a forecast may start at any moment of a step. The notebook then asks the
-# one question that a band must answer: *does 90 % of the truth fall into the 90 % band, on movements never seen?*
+# one question that a band must answer: *does 90 % of the truth fall into the 90 % band, on
+# movements never seen?*
 
 # %%
 import os

@@ -27,6 +27,7 @@ class Sums:
 
 
 def uniform(ratio: float, movements: Movements) -> Float[Tensor, " channel"]:
+    """One noise ratio for every channel."""
     return torch.full((movements[0][0].shape[1],), ratio, dtype=torch.float64)
 
 
@@ -36,6 +37,7 @@ def sums_of(
     movements: Movements,
     timings: list[Timing],
 ) -> Sums:
+    """Sums of every movement, stacked over movements."""
     parts = [
         _sum(primitive, ratio, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)
     ]

@@ -71,6 +71,7 @@ def phases(period: float) -> list[Timing]:
 
 
 def timings_of(primitive: Primitive, movements: Movements, period: float | None) -> list[Timing]:
+    """Duration of discrete movements; tempo and phase of rhythmic ones."""
     if primitive.kind == "discrete":
         return [Timing(len(x) - 1.0) for x, _ in movements]
     return _aligned(primitive, movements, period_of(movements) if period is None else period)
