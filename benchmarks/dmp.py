@@ -151,7 +151,17 @@ def main(rounds: int = 30) -> None:
             f"  weights differ by {f['weights_relative_difference']:.1e} of the largest, "
             f"paths by {f['fit_path_difference']:.1e} rad"
         )
-    payload = {"joints": JOINTS, "steps": STEPS, "kernels": found}
+    f = found[str(KERNELS[0])]
+    card = {
+        "model": "dmp",
+        "what": f"speed against movement-primitives, {JOINTS} joints × {STEPS} steps, "
+        f"{KERNELS[0]} kernels",
+        "value": f"fit {f['fit_ratio']:.0f}×, roll-out {f['roll_out_ratio']:.0f}× "
+        f"(cold {f['cold_roll_out_ratio']:.0f}×)",
+        "source": "simulated",
+        "command": "python -m benchmarks.dmp",
+    }
+    payload = {"joints": JOINTS, "steps": STEPS, "kernels": found, "cards": [card]}
     libraries = ("movement-primitives", "pytransform3d")
     print(store("benchmark_dmp", payload, label="simulated", libraries=libraries, seed=0))
 

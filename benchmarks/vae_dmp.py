@@ -288,9 +288,16 @@ def main(rounds: int = 30) -> None:
             "bars": BARS[name],
             "first_calls_seconds": round(compiled, 1),
         }
+    card = {
+        "model": "vae-dmp",
+        "what": "time of a training step against hand-written PyTorch, d = 50",
+        "value": ", ".join(f"{n}: {p['ratios']['zoo / plain']:.2f}×" for n, p in payload.items()),
+        "source": "simulated",
+        "command": "python -m benchmarks.vae_dmp",
+    }
     store(
         "benchmark_vae_dmp",
-        {"shapes": payload},
+        {"shapes": payload, "cards": [card]},
         label="simulated",
         libraries=("numpyro", "jax"),
         seed=0,
