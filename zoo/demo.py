@@ -16,27 +16,28 @@ from zoo.workflow import forecast_figure, reliability_figure
 
 __all__ = ["main"]
 
-SHARES = (0.5, 0.1, 0.2, 0.2)
+WALK_SHARES = (0.5, 0.1, 0.2, 0.2)
+ARM_SHARES = (0.3, 0.1, 0.3, 0.3)
 STEPS = 6000
 
 
-def demo_data() -> Sequences:
-    """Real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm.
+def demo_data() -> tuple[Sequences, tuple[float, ...]]:
+    """Data and shares of the split: real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm.
 
     The walks are cut into windows of 70 frames at 60 Hz, a little more than a step each.
     """
     if os.environ.get("MOVEZOO_DATA"):
         walks: Sequences = load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
-        return walks.windows(70, stride=10)
-    arm: Sequences = load_data("robot-arm/reaching")
-    return arm
+        return walks.windows(70, stride=10), WALK_SHARES
+    arm: Sequences = load_data("robot-arm/reaching", movements=240)
+    return arm, ARM_SHARES
 
 
 def main(folder: Path = Path("demo")) -> int:
     """Train, calibrate, forecast and evaluate; everything written is under ``folder``."""
     console, began = Console(), time.monotonic()
-    data = demo_data()
-    train, val, calib, test = data.split(by="trial", parts=SHARES, seed=0)
+    data, shares = demo_data()
+    train, val, calib, test = data.split(by="trial", parts=shares, seed=0)
     console.print(
         f"[bold]{data.name}[/] ({data.provenance}): {len(train)} movements to train on, "
         f"{len(val)} to validate, {len(calib)} to calibrate, {len(test)} never seen"
