@@ -22,9 +22,9 @@ STEPS = 6000
 
 
 def demo_data() -> tuple[Sequences, tuple[float, ...]]:
-    """Data and shares of the split: real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm.
+    """Data and the shares of their split.
 
-    The walks are cut into windows of 70 frames at 60 Hz, a little more than a step each.
+    Real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm. The walks are cut into windows of 70 frames at 60 Hz, a little more than a step each.
     """
     if os.environ.get("MOVEZOO_DATA"):
         walks: Sequences = load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
