@@ -24,7 +24,8 @@ STEPS = 6000
 def demo_data() -> tuple[Sequences, tuple[float, ...]]:
     """Data and the shares of their split.
 
-    Real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm. The walks are cut into windows of 70 frames at 60 Hz, a little more than a step each.
+    Real walks where ``MOVEZOO_DATA`` points at them, else the simulated robot arm. The walks are
+    cut into windows of 70 frames at 60 Hz, a little more than a step each.
     """
     if os.environ.get("MOVEZOO_DATA"):
         walks: Sequences = load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
