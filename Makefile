@@ -26,7 +26,7 @@ units: $(INSTALLED)  ## Tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q --durations 10
 
 notebooks: $(INSTALLED)  ## Execute the notebooks
-	$(BIN)/python -m tests.notebooks
+	$(BIN)/python tests/notebooks.py
 
 core: $(CORE)/.installed  ## Smoke test of the wheel in an environment without extras
 	cd $(CORE) && bin/python ../tests/smoke.py
