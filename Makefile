@@ -4,6 +4,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 CORE := $(VENV)-core
 export PYTHONSAFEPATH := 1
+export OMP_NUM_THREADS := 1
 
 .PHONY: help demo test lint types units notebooks core clean
 
@@ -23,7 +24,7 @@ types: $(INSTALLED)  ## Strict types
 	$(BIN)/mypy
 
 units: $(INSTALLED)  ## Tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -q --durations 10
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q --durations 10
 
 notebooks: $(INSTALLED)  ## Execute the notebooks
 	$(BIN)/python tests/notebooks.py

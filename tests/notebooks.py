@@ -24,7 +24,16 @@ def main() -> int:
         copies = [Path(folder) / f"{s.stem}.ipynb" for s in scripts]
         for script, copy in zip(scripts, copies, strict=True):
             jupytext.write(jupytext.read(script), copy)
-        command = [sys.executable, "-m", "pytest", "--nbmake", "--overwrite", "-q", folder]
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "--nbmake",
+            "--overwrite",
+            "-q",
+            "--durations=0",
+            folder,
+        ]
         code = subprocess.run([*command, "--nbmake-timeout=600", "-c", "/dev/null"]).returncode
         return code or sum(_poor(copy) for copy in copies)
 
