@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import torch
 from jaxtyping import Float
@@ -34,6 +34,18 @@ class Scaler:
     input_scale: Float[Tensor, " input"]
     input_shift: Float[Tensor, " input"]
     constant: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a map that could not be undone."""
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"scaling is one of {', '.join(get_args(Kind))}; got {self.kind!r}")
+        for what in ("channel", "input"):
+            scale, shift = getattr(self, f"{what}_scale"), getattr(self, f"{what}_shift")
+            if scale.ndim != 1 or scale.shape != shift.shape:
+                got = f"{tuple(scale.shape)} and {tuple(shift.shape)}"
+                raise ValueError(f"{what} scale and shift must be two equal vectors; got {got}")
+            if not bool((scale > 0).all() and scale.isfinite().all() and shift.isfinite().all()):
+                raise ValueError(f"{what} scale must be positive and finite, shift finite")
 
     @classmethod
     def fit(cls, data: Pairs | Sequences, kind: Kind = "standard") -> Scaler:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ def write(
     replace_file(folder / name, content)
     sealed = json.dumps({**body, "seal": _seal(body)}, indent=1, allow_nan=False)
     replace_file(folder / f"{stem}.json", sealed.encode())
-    for old in folder.glob(f"{stem}-*.safetensors"):
+    for old in folder.glob(f"{stem}-*.safetensors*"):
         if old.name != name:
             old.unlink(missing_ok=True)
 
@@ -50,7 +51,10 @@ def write(
 def read(folder: Path, stem: str, *, version: int) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read what :func:`write` wrote; a damaged, foreign or newer folder is refused."""
     meta = _opened(folder / f"{stem}.json", stem, version)
-    file = folder / Path(str(meta.get("tensors"))).name
+    name = str(meta.get("tensors"))
+    if not re.fullmatch(f"{stem}-[0-9a-f]{{16}}\\.safetensors", name):
+        raise DamagedRunError(f"{folder / stem}.json names {name!r}; a {stem} keeps no such file")
+    file = folder / name
     try:
         content = file.read_bytes()
     except OSError as error:
@@ -59,8 +63,8 @@ def read(folder: Path, stem: str, *, version: int) -> tuple[dict[str, Any], dict
         raise DamagedRunError(f"{file}: the tensors are damaged: their hash is not the one kept")
     try:
         return meta, load_tensors(content)
-    except SafetensorError as error:
-        raise DamagedRunError(f"{file}: not a safetensors file: {error}") from None
+    except (SafetensorError, LookupError, RuntimeError, ValueError) as error:
+        raise DamagedRunError(f"{file}: not a safetensors file: {error!r}") from None
 
 
 def exists(folder: Path, stem: str) -> bool:
@@ -71,7 +75,7 @@ def exists(folder: Path, stem: str) -> bool:
 def clear(folder: Path, stem: str) -> None:
     """Remove it from ``folder``, its index first."""
     (folder / f"{stem}.json").unlink(missing_ok=True)
-    for path in folder.glob(f"{stem}-*.safetensors"):
+    for path in folder.glob(f"{stem}-*.safetensors*"):
         path.unlink(missing_ok=True)
 
 
@@ -112,11 +116,16 @@ def restore(module: nn.Module, prefix: str, tensors: Mapping[str, Tensor]) -> No
     parameters = dict(module.named_parameters())
     for key, value in mine.items():
         target = expected[key]
+        if value.dtype != target.dtype or not bool(value.isfinite().all()):
+            raise DamagedRunError(
+                f"{prefix}.{key} must hold finite {target.dtype}; it holds {value.dtype}"
+                f"{'' if bool(value.isfinite().all()) else ' that are not finite'}"
+            )
         if key in parameters and target.numel() and target.shape != value.shape:
             raise DamagedRunError(
                 f"{prefix}.{key} has shape {tuple(value.shape)}; {tuple(target.shape)} is needed"
             )
-        _put(module, key, value.to(device=target.device, dtype=target.dtype), key in parameters)
+        _put(module, key, value.to(device=target.device), key in parameters)
 
 
 def _put(module: nn.Module, key: str, value: Tensor, trainable: bool) -> None:
@@ -138,9 +147,9 @@ def _opened(index: Path, stem: str, version: int) -> dict[str, Any]:
     if not index.is_file():
         raise DamagedRunError(f"{index.parent} holds no {index.name}: it is not a movezoo {stem}")
     try:
-        body: dict[str, Any] = json.loads(index.read_bytes())
+        body: dict[str, Any] = json.loads(index.read_bytes(), parse_constant=_no_json)
         kind, found, seal = body["format"], body["version"], body.pop("seal", None)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedRunError(f"{index}: not a readable {stem}: {error!r}") from None
     if kind != f"movezoo-{stem}":
         raise DamagedRunError(f"{index}: format is {kind!r}; 'movezoo-{stem}' is needed")
@@ -149,3 +158,7 @@ def _opened(index: Path, stem: str, version: int) -> dict[str, Any]:
     if seal != _seal(body):
         raise DamagedRunError(f"{index}: the index is damaged (its seal differs)")
     return body
+
+
+def _no_json(word: str) -> None:
+    raise ValueError(f"{word} is not JSON")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,28 @@ __all__ = ["FORMAT_VERSION", "load_run", "save_run"]
 
 FORMAT_VERSION = 1
 _LIBRARIES = ("torch", "pyro-ppl", "gpytorch", "numpy")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TrainedOn:
+    name: str
+    fingerprints: list[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Index:
+    """What ``run.json`` must hold, and of which types."""
+
+    entry: str
+    settings: dict[str, Any]
+    layout: Layout
+    scaler: dict[str, Any]
+    seed: int
+    seconds: float
+    history: list[dict[str, Any]]
+    trained_on: _TrainedOn
+    recalibrations: dict[str, dict[str, Any]]
+    versions: dict[str, str]
 
 
 def save_run(run: Run, folder: Path) -> Path:
@@ -55,33 +77,50 @@ def load_run(folder: Path, *, device: str = "cpu") -> Run:
     """Read a run; what is damaged, foreign or of another format version is refused."""
     meta, tensors = archive.read(folder, "run", version=FORMAT_VERSION)
     try:
-        return _rebuild(meta, tensors, device)
-    except (KeyError, TypeError, ValueError) as error:
-        if isinstance(error, DamagedRunError):
-            raise
+        return _rebuild(TypeAdapter(_Index).validate_python(meta), tensors, device)
+    except DamagedRunError:
+        raise
+    except (LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         raise DamagedRunError(f"{folder}/run.json does not describe a run: {error}") from error
 
 
-def _rebuild(meta: dict[str, Any], tensors: dict[str, Tensor], device: str) -> Run:
-    layout = TypeAdapter(Layout).validate_python(meta["layout"])
-    entry = CATALOGUE[meta["entry"]]
-    assembly = assemble(entry, layout, meta["settings"], seed=meta["seed"], device=device)
-    archive.restore(assembly.model, "model", tensors)
-    assembly.model.eval()
-    if assembly.guide is not None:
-        archive.restore(assembly.guide, "guide", tensors)
-        assembly.guide.eval()
+def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
+    entry, layout = CATALOGUE[index.entry], index.layout
+    assembly = assemble(entry, layout, index.settings, seed=index.seed, device=device)
+    parts = {"model": assembly.model, "guide": assembly.guide}
+    modules = {name: module for name, module in parts.items() if module is not None}
+    _check_names(tensors, [*modules, *(f"recalibration.{task}" for task in index.recalibrations)])
+    for name, module in modules.items():
+        archive.restore(module, name, tensors)
+        module.eval()
     return Run(
         assembly=assembly,
-        scaler=Scaler.from_json(meta["scaler"]),
-        history=meta["history"],
-        seconds=meta["seconds"],
-        trained_on=meta["trained_on"],
+        scaler=_scaler(index),
+        history=index.history,
+        seconds=index.seconds,
+        trained_on=asdict(index.trained_on),
         recalibrations={
             task: recalibration_from_state(state, _part(tensors, f"recalibration.{task}."))
-            for task, state in meta["recalibrations"].items()
+            for task, state in index.recalibrations.items()
         },
     )
+
+
+def _scaler(index: _Index) -> Scaler:
+    scaler = Scaler.from_json(index.scaler)
+    for what, scale, names in (
+        ("channels", scaler.channel_scale, index.layout.channels),
+        ("inputs", scaler.input_scale, index.layout.inputs),
+    ):
+        if len(scale) != len(names):
+            raise DamagedRunError(f"the scaling has {len(scale)} {what}; the run has {len(names)}")
+    return scaler
+
+
+def _check_names(tensors: dict[str, Tensor], owners: list[str]) -> None:
+    foreign = [k for k in tensors if not k.startswith(tuple(f"{o}." for o in owners))]
+    if foreign:
+        raise DamagedRunError(f"tensor {foreign[0]!r} belongs to no part of this run")
 
 
 def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -41,6 +41,15 @@ class Layout:
     rate: float | None = None
     frames: int | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse labels that do not go together."""
+        for what, units in (("channels", self.units), ("inputs", self.input_units)):
+            names = getattr(self, what)
+            if len(units) != len(names):
+                raise ValueError(f"{len(names)} {what} have {len(units)} units")
+            if len(set(names)) != len(names):
+                raise ValueError(f"names of {what} must be distinct; got {', '.join(names)}")
+
     def check(self, other: Layout) -> None:
         """Raise a ValueError that names the first difference that matters for prediction."""
         if self.kind != other.kind:

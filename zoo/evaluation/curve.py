@@ -24,6 +24,17 @@ class Curve:
     x: Float[Tensor, " knot"]
     y: Float[Tensor, " knot"]
 
+    def __post_init__(self) -> None:
+        """Refuse knots that make no increasing curve."""
+        x, y = self.x, self.y
+        if x.ndim != 1 or x.shape != y.shape or len(x) < 2:
+            got = f"{tuple(x.shape)}, {tuple(y.shape)}"
+            raise ValueError(f"a curve needs two knots or more; got {got}")
+        if not all(t.is_floating_point() and bool(t.isfinite().all()) for t in (x, y)):
+            raise ValueError("the knots of a curve must be finite")
+        if not bool((x.diff() > 0).all() and (y.diff() >= 0).all()):
+            raise ValueError("the knots of a curve must ascend")
+
     @classmethod
     def through(cls, x: Tensor, y: Tensor, *, from_zero: bool = False) -> Self:
         """The curve through points in ascending ``x``.

@@ -33,6 +33,16 @@ class Factors:
     channel: Float[Tensor, " channel"]
     time: Float[Tensor, " time"]
 
+    def __post_init__(self) -> None:
+        """Refuse what are no factors: one level, and some of channels and of lead times."""
+        for what, axes in (("level", 0), ("channel", 1), ("time", 1)):
+            factor = getattr(self, what)
+            if factor.ndim != axes or not factor.numel():
+                raise ValueError(f"factor {what!r} has shape {tuple(factor.shape)}")
+            real = factor.is_floating_point() and bool(factor.isfinite().all())
+            if not (real and bool((factor >= 0).all())):
+                raise ValueError(f"factor {what!r} must be finite and not negative")
+
     @classmethod
     def fit(
         cls, sizes: Tensor, answer: Answer, by: tuple[By, ...], power: float, common: bool = True
