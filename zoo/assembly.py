@@ -17,7 +17,7 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import UnknownNameError
 from zoo.inference.posterior import seeded
 from zoo.registry import Entry, Scaling, load
-from zoo.strategies import Inference
+from zoo.strategies import Inference, Svi
 from zoo.types import Layout
 
 __all__ = ["Assembly", "assemble", "create", "options"]
@@ -64,6 +64,8 @@ def create(
 
     Every keyword goes to each part that has a field of that name: the model's and the guide's
     ``Config`` and the inference strategy. An unknown keyword or model lists the nearest names.
+    Fewer ``epochs`` than the entry's shorten its tempering and warm-up in proportion, unless these
+    are given too.
 
     >>> import numpy as np, zoo
     >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
@@ -94,7 +96,7 @@ def assemble(
         guide = None
         if guide_class is not None:
             guide = guide_class(layout, model, _config(entry, guide_class.config_class, values))
-    model = model.to(device=device, dtype=model_class.dtype)
+    model = model.to(device=_usable(device), dtype=model_class.dtype)
     guide = None if guide is None else guide.to(device=device, dtype=model_class.dtype)
     return Assembly(
         entry=entry,
@@ -136,18 +138,40 @@ def _config(entry: Entry, kind: type, values: Mapping[str, Any]) -> Any:
 
 
 def _strategy(entry: Entry, values: Mapping[str, Any]) -> Inference:
-    kept = dataclasses.asdict(entry.inference)
+    """The entry's strategy under other settings; fewer epochs shorten the whole schedule."""
+    base = entry.inference
+    epochs = values.get("epochs")
+    if isinstance(base, Svi) and epochs is not None:
+        checked = _validated(entry, Svi, {"epochs": epochs})
+        base = base.lasting(checked.epochs)
+    kept = dataclasses.asdict(base)
     kept.update({k: v for k, v in values.items() if k in kept})
-    strategy: Inference = _validated(entry, type(entry.inference), kept)
+    strategy: Inference = _validated(entry, type(base), kept)
     return strategy
+
+
+def _usable(device: str) -> str:
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device {device!r} cannot be used here: {reason}") from None
+    return device
 
 
 def _validated(entry: Entry, kind: type, values: Mapping[str, Any]) -> Any:
     try:
         return TypeAdapter(kind).validate_python(dict(values))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(p) for p in first["loc"]) or kind.__name__
-        raise ValueError(
-            f"{entry.name}: setting {where}: {first['msg']}; got {first.get('input')!r}"
-        ) from None
+        raise ValueError(f"{entry.name}: {_reason(error)}") from None
+
+
+def _reason(error: ValidationError) -> str:
+    """What is wrong with the first bad setting, in the words of its own check where it has one."""
+    errors = error.errors()
+    first = errors[0]
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
+    name = first["loc"][0]
+    reasons = dict.fromkeys(e["msg"] for e in errors if e["loc"][0] == name)
+    return f"setting {name}: {' or '.join(reasons)}; got {first.get('input')!r}"

@@ -8,13 +8,26 @@ from typing import Literal
 
 __all__ = ["Exact", "Inference", "MarginalLikelihood", "Svi"]
 
+_RAMPS = {"temper_epochs": "c", "warmup_epochs": "β"}
+_LEAST = dict.fromkeys(_RAMPS, 0) | {
+    "epochs": 1,
+    "batch_size": 1,
+    "window": 1,
+    "stride": 1,
+    "patience": 1,
+    "validate_every": 1,
+    "checkpoint_every": 1,
+    "max_steps": 1,
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Svi:
     """Minibatch stochastic variational inference.
 
     ``window`` frames a window (None: whole movements), cut every ``stride`` frames;
-    ``temper_epochs`` is T_a of (87), 0 for none; ``warmup_epochs`` a second schedule on the KL;
+    ``temper_epochs`` is T_a of (87), 0 for none; ``warmup_epochs`` a second schedule on the KL:
+    both end before the last epoch, so that c = β = 1 is reached;
     ``patience`` validations without progress end the training and the best state is restored.
     ``max_steps`` bounds the work on large data: see :meth:`budgeted`.
     """
@@ -35,13 +48,33 @@ class Svi:
 
     def __post_init__(self) -> None:
         """Refuse settings that no training could run with."""
-        for name in ("epochs", "batch_size", "stride", "validate_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate must be positive; got {self.learning_rate}")
-        if self.max_steps is not None and self.max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1; got {self.max_steps}")
+        for name, bound in _LEAST.items():
+            value = getattr(self, name)
+            if value is not None and value < bound:
+                raise ValueError(f"{name} must be at least {bound}; got {value}")
+        for name in ("learning_rate", "clip"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive; got {value}")
+        for name, symbol in _RAMPS.items():
+            if getattr(self, name) >= self.epochs:
+                raise ValueError(
+                    f"{name} must be below epochs, else {symbol} = 1 is never reached; got "
+                    f"{name}={getattr(self, name)} and epochs={self.epochs}: "
+                    f"raise epochs or lower {name} (0 for none)"
+                )
+
+    def lasting(self, epochs: int) -> Svi:
+        """The same schedule over fewer epochs: tempering and warm-up keep their share of it.
+
+        >>> Svi(epochs=1500, temper_epochs=100).lasting(300).temper_epochs
+        20
+        >>> Svi(epochs=1500, temper_epochs=100).lasting(1).temper_epochs
+        0
+        """
+        share = min(1.0, epochs / self.epochs)
+        ramps = {n: min(math.ceil(share * getattr(self, n)), max(0, epochs - 1)) for n in _RAMPS}
+        return replace(self, epochs=epochs, **ramps)
 
     def budgeted(self, steps_an_epoch: int) -> Svi:
         """The same schedule, shortened as a whole where it would take more than ``max_steps``.
@@ -52,15 +85,9 @@ class Svi:
         """
         if self.max_steps is None or self.epochs * steps_an_epoch <= self.max_steps:
             return self
-        epochs = max(1, self.max_steps // steps_an_epoch)
-        share = epochs / self.epochs
-        return replace(
-            self,
-            epochs=epochs,
-            temper_epochs=math.ceil(share * self.temper_epochs),
-            warmup_epochs=math.ceil(share * self.warmup_epochs),
-            validate_every=max(1, math.floor(share * self.validate_every)),
-        )
+        shorter = self.lasting(max(1, self.max_steps // steps_an_epoch))
+        share = shorter.epochs / self.epochs
+        return replace(shorter, validate_every=max(1, math.floor(share * self.validate_every)))
 
 
 @dataclass(frozen=True, kw_only=True)
