@@ -44,7 +44,7 @@ plt.figure(figsize=(9, 3), layout="constrained")
 joint = int(torch.argmax(data.values.var((0, 1))))
 seconds = np.arange(data.values.shape[1]) / data.rate
 for movement in data.values[:12]:
-    plt.plot(seconds, np.rad2deg(movement[:, joint]), color="C0", alpha=0.5, lw=1)
+    plt.plot(seconds, np.rad2deg(movement[:, joint].numpy()), color="C0", alpha=0.5, lw=1)
 plt.axvspan(0, seen / data.rate, color="0.9", label="seen by the forecast")
 plt.xlabel("time / s")
 plt.ylabel("angle / °")
