@@ -34,7 +34,7 @@ from zoo.evaluation.figures import forecast_bands, reliability
 real = bool(os.environ.get("MOVEZOO_DATA"))
 if real:
     walks = zoo.load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
-    data = walks.windows(70, stride=10)
+    data = walks.windows(70, stride=20)
 else:
     data = zoo.load_data("robot-arm/reaching")
 train, val, calib, test = data.split(by="trial", parts=(0.5, 0.1, 0.2, 0.2), seed=0)
