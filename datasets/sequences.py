@@ -134,6 +134,8 @@ class Sequences:
     @property
     def layout(self) -> Layout:
         """Names, units, rate (None after time normalisation) and the length all have, if any."""
+        if not len(self):
+            raise ValueError(f"{self.name!r} holds no movement")
         equal = bool((self.lengths == self.lengths[0]).all())
         return Layout(
             kind="sequences",

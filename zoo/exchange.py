@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from zoo.assembly import Assembly
@@ -75,6 +75,8 @@ class Exchange:
                 f"goal has shape {array.shape}; ({width},) or ({count}, {width}) is needed, "
                 f"in {layout.units[0] or 'the units of the data'}"
             )
+        if not np.isfinite(array).all():
+            raise ValueError("goal must be finite in every channel")
         rows = torch.from_numpy(np.broadcast_to(array, (count, width)).copy())
         scaled = (rows - self.scaler.channel_shift) / self.scaler.channel_scale
         return scaled.to(dtype=self.assembly.dtype, device=self.assembly.device)
@@ -83,6 +85,8 @@ class Exchange:
         """Inputs without targets as pairs of the model's layout."""
         if isinstance(data, Pairs):
             return data
+        if isinstance(data, Sequences):
+            raise TypeError(f"{self.assembly.entry.name} predicts Pairs; got Sequences")
         layout = self.assembly.layout
         inputs = np.asarray(data, dtype=np.float64)
         if inputs.ndim != 2 or inputs.shape[1] != len(layout.inputs):
@@ -101,12 +105,24 @@ class Exchange:
 
 def fingerprints(data: Pairs | Sequences) -> list[str]:
     """A short hash of every movement or item: equal data have equal ones."""
+    rows: Iterable[tuple[NDArray[np.float64], ...]]
     if isinstance(data, Pairs):
-        rows = [torch.cat([x[:64], y]) for x, y in zip(data.inputs, data.targets, strict=True)]
+        rows = zip(_doubles(data.inputs), _doubles(data.targets), strict=True)
     else:
-        rows = [v[:n] for v, n in zip(data.values, data.lengths.tolist(), strict=True)]
-    content = (r.double().cpu().contiguous().numpy().tobytes() for r in rows)
-    return [hashlib.blake2b(c, digest_size=8).hexdigest() for c in content]
+        lengths = data.lengths.tolist()
+        rows = ((v[:n],) for v, n in zip(_doubles(data.values), lengths, strict=True))
+    return [_digest(*row) for row in rows]
+
+
+def _doubles(values: Tensor) -> NDArray[np.float64]:
+    return np.ascontiguousarray(values.double().cpu().numpy())
+
+
+def _digest(*parts: NDArray[np.float64]) -> str:
+    content = hashlib.blake2b(digest_size=8)
+    for part in parts:
+        content.update(part.data)
+    return content.hexdigest()
 
 
 def _merge(parts: Sequence[tuple[Sequence[int], Predictive]], count: int) -> Predictive:

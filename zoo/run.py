@@ -250,7 +250,9 @@ def fit(
     >>> run.reconstruct(data).shape
     (4, 20, 3)
     """
-    assembly.layout.check(train.layout)
+    for part in (train, val):
+        if part is not None:
+            assembly.layout.check(part.layout)
     began = time.monotonic()
     scaler = Scaler.fit(train, assembly.scaling)
     model, guide = copy.deepcopy((assembly.model, assembly.guide))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import asdict, dataclass
 from importlib.metadata import version as installed
@@ -59,7 +60,7 @@ def save_run(run: Run, folder: Path) -> Path:
         tensors.update({f"recalibration.{task}.{k}": v for k, v in extra.items()})
     meta = {
         "entry": assembly.entry.name,
-        "settings": dict(assembly.settings),
+        "settings": json.loads(json.dumps(dict(assembly.settings), default=_plain)),
         "layout": asdict(assembly.layout),
         "scaler": run.scaler.to_json(),
         "seed": assembly.seed,
@@ -131,3 +132,8 @@ def _finite(row: dict[str, Any]) -> dict[str, Any]:
     """JSON has no infinities: they are stored as null."""
     bad = {k for k, v in row.items() if isinstance(v, float) and not math.isfinite(v)}
     return {k: None if k in bad else v for k, v in row.items()}
+
+
+def _plain(number: Any) -> Any:
+    """A number or array of numpy as JSON has it."""
+    return number.tolist()

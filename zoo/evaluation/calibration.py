@@ -165,7 +165,8 @@ class Conformal:
         )
 
     def _spread(self, raw: Prediction) -> Tensor:
-        return raw.std * self.factors.of(raw)
+        spread = raw.std * self.factors.of(raw)
+        return spread.clamp(min=torch.finfo(spread.dtype).tiny)
 
 
 @dataclass(frozen=True, kw_only=True)

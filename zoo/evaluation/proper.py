@@ -35,8 +35,7 @@ def crps(prediction: Prediction, truth: Tensor) -> Tensor:
     if p.spread is None:
         return _tensor(scoringrules.crps_ensemble(*_arrays(truth, p.location), m_axis=0))
     if p.location.shape[0] == 1:
-        parts = _arrays(truth, p.location[0], p.spread.expand_as(p.location)[0])
-        return _tensor(scoringrules.crps_normal(*parts))
+        return _normal_crps(p.location[0], p.spread.expand_as(p.location)[0], truth)
     return _mixture_crps(p, p.spread, truth)
 
 
@@ -79,6 +78,13 @@ def variogram_scores(draws: Tensor, answer: Answer) -> Float[Tensor, "pair seque
         total += torch.where(both, miss, 0.0).sum((1, 2))
         pairs += both.sum((1, 2))
     return torch.stack([total, pairs])
+
+
+def _normal_crps(mean: Tensor, std: Tensor, truth: Tensor) -> Tensor:
+    """Without a spread, as in frames beyond a movement's end, it is the distance."""
+    parts = _arrays(truth, mean, torch.where(std > 0, std, 1.0))
+    distance = (truth.double() - mean.double()).abs()
+    return torch.where(std > 0, _tensor(scoringrules.crps_normal(*parts)).to(distance), distance)
 
 
 def _mixture_crps(p: Predictive, scale: Tensor, truth: Tensor) -> Tensor:
