@@ -22,7 +22,7 @@ from zoo.types import Batch, Posterior
 
 __all__ = ["Answer", "Exchange", "fingerprints"]
 
-Answer = Callable[[Batch, Posterior | None], Predictive]
+Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,22 +48,32 @@ class Exchange:
             self.scaler.channel_scale.to(like), self.scaler.channel_shift.to(like)
         )
 
-    def answer(self, data: Sequences, answer: Answer, seed: int) -> Predictive:
-        """Ask about movements of one length at a time, on a random stream of its own."""
-        scaled = self.scaled(data)
-        if not isinstance(scaled, Sequences):
+    def movements(self, data: Any) -> Sequences:
+        """Scaled movements; regression data are refused."""
+        if not isinstance(data, Sequences):
             raise TypeError(
                 f"{self.assembly.entry.name} predicts Sequences; got {type(data).__name__}"
             )
+        scaled: Sequences = self.scaled(data)
+        return scaled
+
+    def answer(self, data: Sequences, answer: Answer, seed: int) -> tuple[Predictive, Tensor]:
+        """Ask about movements of one length at a time, on a random stream of its own.
+
+        ``answer`` is told which rows of ``data`` its batch holds; beside the answers stands how
+        many frames each movement got.
+        """
+        scaled = self.movements(data)
         lengths = scaled.lengths.tolist()
         guide = self.assembly.guide
         posterior = None if guide is None else GuidePosterior(guide)
-        parts = []
+        parts, frames = [], torch.zeros(len(scaled), dtype=torch.long)
         with seeded(seed, self.assembly.device), torch.no_grad():
             for length in sorted(set(lengths)):
                 rows = [i for i, n in enumerate(lengths) if n == length]
-                parts.append((rows, answer(whole(scaled[rows]), posterior)))
-        return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled))
+                parts.append((rows, answer(whole(scaled[rows]), posterior, rows)))
+                frames[rows] = parts[-1][1].location.shape[2]
+        return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled)), frames
 
     def goal(self, goal: ArrayLike, count: int) -> Tensor:
         """A last frame to reach, for each of ``count`` movements, in the model's scale."""
@@ -80,6 +90,19 @@ class Exchange:
         rows = torch.from_numpy(np.broadcast_to(array, (count, width)).copy())
         scaled = (rows - self.scaler.channel_shift) / self.scaler.channel_scale
         return scaled.to(dtype=self.assembly.dtype, device=self.assembly.device)
+
+    def onto(self, onto: Sequences, count: int) -> Sequences:
+        """Movements to switch to, one for each of ``count``, in the model's scale."""
+        scaled = self.movements(onto)
+        if len(onto) not in (1, count):
+            raise ValueError(f"onto has {len(onto)} movements; 1 or {count} are needed")
+        frames = scaled.lengths.unique().tolist()
+        if len(frames) > 1:
+            raise ValueError(
+                f"onto has movements of {frames[0]} to {frames[-1]} frames; one length is needed: "
+                f"bring them to it by onto.resampled({frames[0]})"
+            )
+        return scaled[[0] * count] if len(onto) == 1 else scaled
 
     def pairs(self, data: Pairs | ArrayLike) -> Pairs:
         """Inputs without targets as pairs of the model's layout."""

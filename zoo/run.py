@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -78,7 +79,7 @@ class Run:
             raise ValueError(f"horizon must be at least 1 frame; got {horizon}")
         forecast = self._capability("forecast")
 
-        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
             return forecast(batch, posterior, horizon=horizon, draws=draws)
 
         prediction = self._predict("forecast", data, answer, seed)
@@ -96,10 +97,10 @@ class Run:
         """Latent trajectories of the movements."""
         represent = self._capability("represent")
 
-        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
             return represent(batch, posterior, draws=draws)
 
-        latent = self.exchange.answer(data, answer, seed)
+        latent, frames = self.exchange.answer(data, answer, seed)
         count = latent.location.shape[-1]
         return Prediction(
             predictive=latent,
@@ -108,7 +109,7 @@ class Run:
             units=("",) * count,
             task="represent",
             rate=data.rate,
-            lengths=data.lengths,
+            lengths=frames,
         )
 
     def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
@@ -141,23 +142,23 @@ class Run:
     ) -> Prediction:
         """New movements after the demonstrations ``like``.
 
-        ``goal`` is the last frame to reach, in the data's units, one for all or one for each
-        movement; ``duration`` stretches time; ``onto`` are the movements to switch to from frame
-        ``start`` over ``steps`` frames, (89).
+        ``goal`` is the last frame to reach (of a rhythmic movement the centre to swing about), in
+        the data's units, one for all or one for each movement; ``duration`` stretches time;
+        ``onto`` are the movements to switch to, one for all or one for each, from frame ``start``
+        of the new movement over ``steps`` frames, (89).
         """
         generate = self._capability("generate")
-        if duration <= 0:
-            raise ValueError(f"duration must be positive; got {duration}")
+        _check_timing(like, duration, onto is not None, start, steps)
         target = None if goal is None else self.exchange.goal(goal, len(like))
-        other = None if onto is None else whole(self.exchange.scaled(onto))
+        other = None if onto is None else self.exchange.onto(onto, len(like))
 
-        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
             return generate(
                 batch,
                 posterior,
-                goal=target,
+                goal=None if target is None else target[rows],
                 duration=duration,
-                onto=other,
+                onto=None if other is None else whole(other[rows]),
                 start=start,
                 steps=steps,
                 draws=draws,
@@ -199,13 +200,14 @@ class Run:
     def _simple(self, task: Any, data: Sequences, draws: int, seed: int) -> Prediction:
         method = self._capability(task)
 
-        def answer(batch: Batch, posterior: Posterior | None) -> Predictive:
+        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
             return method(batch, posterior, draws=draws)
 
         return self._predict(task, data, answer, seed)
 
     def _predict(self, task: Any, data: Sequences, answer: Answer, seed: int) -> Prediction:
-        predictive = self.exchange.unscaled(self.exchange.answer(data, answer, seed), task)
+        scaled, frames = self.exchange.answer(data, answer, seed)
+        predictive = self.exchange.unscaled(scaled, task)
         layout = self.assembly.layout
         return Prediction(
             predictive=predictive,
@@ -214,7 +216,7 @@ class Run:
             units=layout.units,
             task=task,
             rate=layout.rate,
-            lengths=data.lengths,
+            lengths=frames,
             recalibration=self.recalibrations.get(_question(task, data)),
         )
 
@@ -303,6 +305,24 @@ def load(folder: str | Path) -> Run:
     from zoo.storage import load_run
 
     return load_run(Path(folder))
+
+
+def _check_timing(like: Sequences, duration: float, switches: bool, start: int, steps: int) -> None:
+    """Refuse a duration without frames, and a switch outside the new movement."""
+    if not 0 < duration < math.inf:
+        raise ValueError(f"duration must be positive and finite; got {duration}")
+    shortest = int(like.lengths.min())
+    frames = round((shortest - 1) * duration) + 1
+    if frames < 3:
+        raise ValueError(
+            f"duration={duration:g} leaves {frames} of {shortest} frames; at least 3 are needed"
+        )
+    if not switches and (start, steps) != (0, 1):
+        raise ValueError("start and steps are those of a switch: name the movements to go onto")
+    if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
+        raise ValueError(
+            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
+        )
 
 
 def _question(task: str, data: Sequences) -> str:
