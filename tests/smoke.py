@@ -14,7 +14,7 @@ def main() -> None:
     """Fail loudly where the wheel or its dependencies lack something."""
     rng = np.random.default_rng(0)
     data = zoo.Sequences.from_arrays(
-        [np.cumsum(rng.normal(size=(20, 4)), 0) for _ in range(8)], rate=30.0, units="rad"
+        [np.cumsum(rng.normal(size=(30, 7)), 0) for _ in range(8)], rate=30.0, units="rad"
     )
     train, calib = data.split(by="trial", parts=(0.5, 0.5), seed=0)
     with tempfile.TemporaryDirectory() as folder:
