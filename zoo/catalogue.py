@@ -10,7 +10,13 @@ from zoo.strategies import Exact, MarginalLikelihood, Svi
 __all__ = ["CATALOGUE", "list_models"]
 
 _VAE_DMP = Svi(
-    window=10, epochs=1500, batch_size=64, learning_rate=5e-3, clip=100.0, temper_epochs=100
+    window=10,
+    epochs=1500,
+    batch_size=64,
+    learning_rate=5e-3,
+    clip=100.0,
+    temper_epochs=100,
+    max_steps=30_000,
 )
 
 CATALOGUE = Registry(
@@ -45,6 +51,16 @@ CATALOGUE = Registry(
             data="sequences",
             dataset="cmu-mocap/35-walk",
             config={"kind": "rhythmic", "kernels": 12},
+        ),
+        Entry(
+            name="promp",
+            summary="Probabilistic movement primitives: joint Gaussian of all weights, exact",
+            thesis="rival, §5.1",
+            model="zoo.models.promp:ProMP",
+            guide=None,
+            inference=Exact(),
+            data="sequences",
+            dataset="robot-arm/reaching",
         ),
         Entry(
             name="vae",
@@ -156,6 +172,16 @@ CATALOGUE = Registry(
             summary="The most similar training movements, continued",
             thesis="baseline, not in the thesis",
             model="zoo.models.nearest_neighbour:NearestNeighbour",
+            guide=None,
+            inference=Exact(),
+            data="sequences",
+            dataset="robot-arm/reaching",
+        ),
+        Entry(
+            name="kernel-ridge",
+            summary="Missing and future entries regressed on those seen, by kernel ridge",
+            thesis="baseline, not in the thesis",
+            model="zoo.models.kernel_ridge:KernelRidge",
             guide=None,
             inference=Exact(),
             data="sequences",
