@@ -26,7 +26,7 @@ STEPS = 6000
 def walk() -> Sequences:
     """Real walks in windows."""
     walks: Sequences = zoo.load_data("cmu-mocap/35-walk", frames=None, rate=60.0)
-    return walks.windows(70, stride=10)
+    return walks.windows(70, stride=20)
 
 
 def reaching() -> Sequences:
