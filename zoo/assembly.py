@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints
 
 import torch
 from pydantic import TypeAdapter, ValidationError
@@ -116,11 +116,13 @@ def options(entry: Entry) -> dict[str, tuple[str, Any, Any]]:
     found: dict[str, tuple[str, Any, Any]] = {}
     for part, path in (("guide", entry.guide), ("model", entry.model)):
         if path is not None:
+            kinds = get_type_hints(load(path).config_class)
             for field in dataclasses.fields(load(path).config_class):
                 default = entry.config.get(field.name, field.default)
-                found[field.name] = (part, field.type, default)
+                found[field.name] = (part, kinds[field.name], default)
+    kinds = get_type_hints(type(entry.inference))
     for field in dataclasses.fields(entry.inference):
-        found[field.name] = ("inference", field.type, getattr(entry.inference, field.name))
+        found[field.name] = ("inference", kinds[field.name], getattr(entry.inference, field.name))
     found["scaling"] = ("data", Scaling, entry.scaling)
     return found
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
-from collections.abc import Mapping
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import groupby
 from typing import Any
 
-from rich.console import Console, ConsoleOptions, Group, RenderResult
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import Markdown
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -28,6 +33,7 @@ class Card:
     entry: Entry
     text: str
     settings: Mapping[str, tuple[str, Any, Any]]
+    meanings: tuple[str, ...]
     results: tuple[Mapping[str, Any], ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -41,15 +47,22 @@ class Card:
             "dataset": self.entry.dataset,
             "inference": type(self.entry.inference).__name__,
             "text": self.text,
-            "settings": {k: {"part": p, "default": d} for k, (p, _, d) in self.settings.items()},
+            "settings": {
+                k: {"part": p, "type": _type(t), "default": d}
+                for k, (p, t, d) in self.settings.items()
+            },
+            "meanings": list(self.meanings),
             "results": [dict(r) for r in self.results],
         }
 
     def markdown(self) -> str:
         """The card as Markdown."""
-        lines = [f"# {self.entry.name}", "", self.text, "", "| setting | part | default |"]
-        lines += ["|---|---|---|"]
-        lines += [f"| `{k}` | {p} | {d!r} |" for k, (p, _, d) in self.settings.items()]
+        lines = [f"# {self.entry.name}", "", _markdown(self.text), ""]
+        lines += ["| setting | part | values | default |", "|---|---|---|---|"]
+        for key, (part, kind, default) in self.settings.items():
+            values = _type(kind).replace("|", "or")
+            lines.append(f"| `{key}` | {part} | {values} | {default!r} |")
+        lines += [f"\n{_markdown(m)}" for m in self.meanings]
         lines += [""] + [f"- {_sentence(r)}" for r in self.results]
         return "\n".join(lines)
 
@@ -62,15 +75,21 @@ class Card:
             f"default data {self.entry.dataset}\n",
             style="dim",
         )
-        yield Markdown(self.text)
-        yield Group(Text("\nSettings (zoo fit … --set KEY=VALUE)", style="bold"), self._settings())
+        yield from _shown(self.text)
+        yield Text("\nSettings (zoo fit … --set KEY=VALUE)", style="bold")
+        yield self._settings()
+        for meaning in self.meanings:
+            yield Text()
+            yield from _shown(meaning)
+        if self.results:
+            yield Text("\nMeasured", style="bold")
         for result in self.results:
             yield Text(f"• {_sentence(result)}")
 
     def _settings(self) -> Table:
-        table = Table("setting", "of", "default", box=None, pad_edge=False)
-        for key, (part, _, default) in self.settings.items():
-            table.add_row(key, part, repr(default))
+        table = Table("setting", "of", "values", "default", box=None, pad_edge=False)
+        for key, (part, kind, default) in self.settings.items():
+            table.add_row(key, part, Text(_type(kind)), Text(repr(default)))
         return table
 
 
@@ -85,6 +104,7 @@ def card(name: str) -> Card:
         entry=entry,
         text=inspect.getdoc(load(entry.model)) or "",
         settings=options(entry),
+        meanings=tuple(_meanings(entry)),
         results=measured(name),
     )
 
@@ -97,6 +117,48 @@ def measured(name: str) -> tuple[Mapping[str, Any], ...]:
             payload = json.loads(file.read_text(encoding="utf-8"))
             found += [r for r in payload.get("cards", []) if r.get("model") == name]
     return tuple(found)
+
+
+def _meanings(entry: Entry) -> Iterator[str]:
+    """What the settings mean, part by part, where a part has any."""
+    kinds = [load(path).config_class for path in (entry.model, entry.guide) if path is not None]
+    for kind in (*kinds, type(entry.inference)):
+        if dataclasses.fields(kind):
+            yield inspect.getdoc(kind) or ""
+
+
+def _type(kind: Any) -> str:
+    """The values that a setting takes, in words."""
+    words = kind.__name__ if isinstance(kind, type) else str(kind)
+    return re.sub(r"(?:typing\.)?Literal\[([^]]*)\]", _choices, words)
+
+
+def _choices(match: re.Match[str]) -> str:
+    return " | ".join(word.strip().strip("\"'") for word in match[1].split(","))
+
+
+def _blocks(text: str) -> Iterator[tuple[bool, str]]:
+    """Prose and literal blocks of a docstring by turns, each with whether it is literal."""
+    text = re.sub(r":\w+:`~?([^`]+)`", lambda m: f"``{m[1].rpartition('.')[2]}``", text)
+    paragraphs = re.split(r"\n\s*\n", text)
+    for literal, group in groupby(paragraphs, key=lambda p: p.startswith("    ")):
+        yield literal, textwrap.dedent("\n\n".join(group)).replace("::", ":")
+
+
+def _prose(text: str) -> str:
+    """Markdown in which stars and underscores of formulas stay what they are."""
+    parts = re.split(r"(``[^`]*``|(?<!\S)\*\w[^*]*\w\*(?!\w))", text)
+    return "".join(p if i % 2 else re.sub(r"([*_])", r"\\\1", p) for i, p in enumerate(parts))
+
+
+def _markdown(text: str) -> str:
+    parts = (f"```text\n{b}\n```" if literal else _prose(b) for literal, b in _blocks(text))
+    return "\n\n".join(parts)
+
+
+def _shown(text: str) -> Iterator[Markdown | Padding]:
+    for literal, block in _blocks(text):
+        yield Padding(Text(block), (1, 0, 1, 2)) if literal else Markdown(_prose(block))
 
 
 def _sentence(result: Mapping[str, Any]) -> str:

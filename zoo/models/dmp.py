@@ -79,7 +79,8 @@ class DMP(nn.Module):
 
     For every joint::
 
-        τ² ÿ = α (β (g − y) − τ ẏ) + Ψ(s)w + σ_f ε,   x_t ~ N(y_t, σ² ρ),   ε ~ N(0, 1)
+        τ² ÿ = α (β (g − y) − τ ẏ) + Ψ(s)w + σ_f ε,   ε ~ N(0, 1)
+        x_t ~ N(y_t, σ² ρ)
 
     so that f_target ~ N(Ψ(s)w, σ_f²), (59). θ = (y₁, ẏ₁, g, w) is Gaussian over movements, with
     factors that joints share and a part of each joint alone; how much is shared is chosen by the
