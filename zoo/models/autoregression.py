@@ -174,23 +174,23 @@ class Autoregression(nn.Module):
         """Ridge estimate (block, 1 + lags, width) with the intercept first, and Q."""
         x = torch.cat([torch.ones_like(past[..., :1]), past], -1)
         count = weight.sum((0, 1))[..., None]
-        penalty = torch.full((x.shape[-1],), self.config.ridge).to(x)
+        penalty = x.new_full((x.shape[-1],), self.config.ridge)
         penalty[0] = 0
         gram = torch.einsum("stbf,stbg->bfg", weight * x, x) + count * penalty.diag()
         beta = torch.linalg.solve(gram, torch.einsum("stbf,stbw->bfw", weight * x, now))
         residual = weight * (now - torch.einsum("stbf,bfw->stbw", x, beta))
         innovation = torch.einsum("stbv,stbw->bvw", residual, residual) / (count - x.shape[-1])
-        return beta, innovation + self._floor(self.width).to(x)
+        return beta, innovation + self._floor(innovation)
 
     def _start(self, past: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         count = weight.sum((0, 1))
         mean = (past * weight).sum((0, 1)) / count
         off = (past - mean) * weight
         covariance = torch.einsum("stbv,stbw->bvw", off, off) / (count - 1)[..., None]
-        return mean, covariance + self._floor(past.shape[-1]).to(past)
+        return mean, covariance + self._floor(covariance)
 
-    def _floor(self, size: int) -> Tensor:
-        return self.config.noise_floor**2 * torch.eye(size)
+    def _floor(self, like: Float[Tensor, "block width width"]) -> Float[Tensor, "width width"]:
+        return self.config.noise_floor**2 * _identity(like)
 
     def _next(self, past: Float[Tensor, "window run block value"]) -> Tensor:
         lags = past.unflatten(-1, (self.config.order, self.width)).flip(-2)
@@ -230,7 +230,7 @@ class Autoregression(nn.Module):
         root = torch.linalg.cholesky(held)
         pull = missing * (shift - (precision @ x[..., None]).squeeze(-1))
         mean = x + missing * torch.cholesky_solve(pull[..., None], root).squeeze(-1)
-        inverse = torch.linalg.solve_triangular(root, torch.eye(len(shift[0])).to(x), upper=False)
+        inverse = torch.linalg.solve_triangular(root, _identity(root), upper=False)
         rounding = torch.finfo(x.dtype).eps ** 0.5
         spread = (missing * inverse.square().sum(-2).sqrt()).clamp(min=rounding).expand_as(mean)
         unit = torch.randn(draws, *mean.shape, dtype=x.dtype, device=x.device)
@@ -243,3 +243,7 @@ class Autoregression(nn.Module):
     def _framed(self, x: Float[Tensor, "*sample window block value"]) -> Tensor:
         frames: Tensor = x.unflatten(-1, (-1, self.width)).transpose(-3, -2)
         return frames.flatten(-2)
+
+
+def _identity(like: Float[Tensor, "*batch n n"]) -> Float[Tensor, "n n"]:
+    return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)

@@ -161,7 +161,7 @@ class GaussianProcess(nn.Module):
             rows = mask.reshape(y.shape)[:, p]
             kernel = 0 if self.config.shared else p
             covariance = self._kernel(kernel, x[rows], x[rows])
-            covariance = covariance + self.noise[kernel] * torch.eye(len(covariance)).to(y)
+            covariance = covariance + torch.diag(self.noise[kernel].expand(len(covariance)))
             law = MultivariateNormal(torch.zeros_like(y[rows, p]), self.signal[p] * covariance)
             pyro.sample(f"y_{p}", law, obs=y[rows, p])
 

@@ -31,7 +31,28 @@ class Config:
             raise ValueError(f"noise_floor must be positive; got {self.noise_floor}")
 
 
-class Mean(nn.Module):
+class _Moments(nn.Module):
+    """Mean, standard deviation and standard error of the mean."""
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float64
+    mean: Tensor
+    deviation: Tensor
+    error: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """Placeholders until ``condition``."""
+        super().__init__()
+        self.layout, self.config = layout, config
+        for name in ("mean", "deviation", "error"):
+            self.register_buffer(name, torch.empty(0, dtype=self.dtype))
+
+    def _keep(self, mean: Tensor, deviation: Tensor, count: Tensor) -> None:
+        self.mean, self.deviation = mean, deviation.clamp(min=self.config.noise_floor)
+        self.error = self.deviation / count.sqrt()
+
+
+class Mean(_Moments):
     """Every frame is the mean of that frame over the training movements, whatever was seen.
 
     x_{t,c} ~ N(m_{t,c}, s_{t,c}²), m_{t,c} known to s_{t,c}/√n
@@ -45,19 +66,6 @@ class Mean(nn.Module):
     Defaults: data standardised; missing entries left out.
     """
 
-    config_class: ClassVar[type] = Config
-    dtype: ClassVar[torch.dtype] = torch.float64
-    mean: Tensor
-    deviation: Tensor
-    error: Tensor
-
-    def __init__(self, layout: Layout, config: Config) -> None:
-        """Placeholders until :meth:`condition`."""
-        super().__init__()
-        self.layout, self.config = layout, config
-        for name in ("mean", "deviation", "error"):
-            self.register_buffer(name, torch.empty(0, dtype=self.dtype))
-
     def condition(self, data: Sequences | Pairs) -> None:
         """Moments of every frame; the last row holds those of all frames."""
         movements = movements_of("mean", data, self.dtype)
@@ -65,13 +73,11 @@ class Mean(nn.Module):
         frame = moments(values, mask, 0)
         overall = moments(values.flatten(0, 1), mask.flatten(0, 1), 0)
         few = frame[2] < 2
-        mean, deviation, count = (
+        rows = (
             torch.cat([torch.where(few, o, f), o[None]])
             for f, o in zip(frame, overall, strict=True)
         )
-        self.mean = mean
-        self.deviation = deviation.clamp(min=self.config.noise_floor)
-        self.error = self.deviation / count.sqrt()
+        self._keep(*rows)
 
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every frame on its own."""
@@ -109,7 +115,7 @@ class Mean(nn.Module):
         )
 
 
-class MeanRegressor(nn.Module):
+class MeanRegressor(_Moments):
     """Every target is its training mean, whatever the inputs.
 
     y_p ~ N(m_p, s_p²), m_p known to s_p/√n
@@ -121,19 +127,6 @@ class MeanRegressor(nn.Module):
     Defaults: data standardised; missing targets left out.
     """
 
-    config_class: ClassVar[type] = Config
-    dtype: ClassVar[torch.dtype] = torch.float64
-    mean: Tensor
-    deviation: Tensor
-    error: Tensor
-
-    def __init__(self, layout: Layout, config: Config) -> None:
-        """Placeholders until :meth:`condition`."""
-        super().__init__()
-        self.layout, self.config = layout, config
-        for name in ("mean", "deviation", "error"):
-            self.register_buffer(name, torch.empty(0, dtype=self.dtype))
-
     def condition(self, data: Sequences | Pairs) -> None:
         """Moments of every target."""
         if not isinstance(data, Pairs):
@@ -143,9 +136,7 @@ class MeanRegressor(nn.Module):
             target = data.channels[int(never.nonzero()[0])]
             raise ValueError(f"target {target} is missing in every item; drop it")
         values = torch.where(data.mask, data.targets, 0.0).to(self.dtype)
-        self.mean, deviation, count = moments(values, data.mask, 0)
-        self.deviation = deviation.clamp(min=self.config.noise_floor)
-        self.error = self.deviation / count.sqrt()
+        self._keep(*moments(values, data.mask, 0))
 
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every item on its own."""

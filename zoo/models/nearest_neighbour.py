@@ -106,7 +106,7 @@ class NearestNeighbour(nn.Module):
                 f"{self.config.context} frames; the longest has {int(movements.lengths.max())}"
             )
         self.seen, self.lengths = movements.mask, movements.lengths
-        self.group = self._groups(movements).to(self.lengths)
+        self.group = self._groups(movements)
         mean, _, _ = moments(movements.values.flatten(0, 1), self.seen.flatten(0, 1), 0)
         self.memory = interpolated(movements.values, self.seen, mean)
         self.noise = self._forecast_noise()
@@ -156,13 +156,19 @@ class NearestNeighbour(nn.Module):
                 "nearest-neighbour needs at least 2 "
                 f"{'movements' if column is None else column + ' groups'} to fit its spread; got 1"
             )
-        return torch.tensor([order.index(label) for label in labels])
+        numbers = [order.index(label) for label in labels]
+        return torch.tensor(numbers, device=data.lengths.device)
 
     def _nobody(self, queries: int) -> Bool[Tensor, "query movement"]:
         return torch.zeros(queries, len(self.memory), dtype=torch.bool, device=self.memory.device)
 
     def _ahead(self, queries: Tensor, horizon: int) -> Int[Tensor, " query"]:
         return torch.full((len(queries),), horizon, device=queries.device)
+
+    def _spread_out(self, first: int, last: int, count: int) -> Int[Tensor, " place"]:
+        even = torch.linspace(first, last, count, device=self.memory.device)
+        places: Tensor = even.long().unique()
+        return places
 
     def _continued(
         self,
@@ -229,9 +235,9 @@ class NearestNeighbour(nn.Module):
     def _left_out(self, i: int) -> Float[Tensor, "3 lead channel"]:
         """Sums of squared error, of the neighbours' variance, and their count, by lead."""
         context, length = self.config.context, int(self.lengths[i])
-        place = torch.linspace(context, length - 1, self.config.positions).long().unique()
-        back = place[:, None] + torch.arange(-context, 0)
-        lead = place[:, None] + torch.arange(length - context)
+        place = self._spread_out(context, length - 1, self.config.positions)
+        back = place[:, None] + torch.arange(-context, 0, device=place.device)
+        lead = place[:, None] + torch.arange(length - context, device=place.device)
         inside = lead.clamp(max=length - 1)
         banned = (self.group == self.group[i]).expand(len(place), -1)
         near = self._continued(self.memory[i, back], self.seen[i, back], length - place, banned)
@@ -277,8 +283,8 @@ class NearestNeighbour(nn.Module):
         self, pattern: Bool[Tensor, "time channel"], movements: int
     ) -> Float[Tensor, " channel"]:
         """s of every channel where left-out movements miss the entries that ``pattern`` misses."""
-        rows = torch.linspace(0, len(self.memory) - 1, min(movements, len(self.memory))).long()
-        sums = [self._left_out_filled(i, pattern) for i in rows.unique().tolist()]
+        rows = self._spread_out(0, len(self.memory) - 1, min(movements, len(self.memory)))
+        sums = [self._left_out_filled(i, pattern) for i in rows.tolist()]
         wrong, spread, count = torch.stack(sums).sum(0)
         return self._unexplained(wrong / count.clamp(min=1), spread / count.clamp(min=1))
 

@@ -142,8 +142,8 @@ class SparseGaussianProcess(nn.Module):
         """Take in the training pairs, draw inducing inputs, compute their distances once."""
         data = pairs_of(data)
         known = data.mask.any(1).nonzero()[:, 0]
-        chosen = known[torch.randperm(len(known))[: self.config.count(len(known))]]
-        self._set_inducing(data.inputs[chosen].to(self.dtype))
+        order = torch.randperm(len(known), device=known.device)[: self.config.count(len(known))]
+        self._set_inducing(data.inputs[known[order]].to(self.dtype))
         self._training = _Training(
             data.inputs,
             Collapsed(data.targets.to(self.dtype), patterns(data.mask), self.config.bound),
@@ -252,7 +252,7 @@ class SparseGaussianProcess(nn.Module):
         return self._jittered(k_uu), training.across, self.log_length[0]
 
     def _jittered(self, k_uu: Tensor) -> Tensor:
-        return k_uu + self.config.jitter * torch.eye(len(k_uu), dtype=k_uu.dtype)
+        return k_uu + torch.diag(k_uu.new_full((len(k_uu),), self.config.jitter))
 
     def _kernel(self, a: Tensor, b: Tensor) -> Tensor:
         distances = squared_distances(a / self.length, b / self.length)
