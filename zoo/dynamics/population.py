@@ -30,7 +30,7 @@ class Population:
 
     def condition(
         self,
-        precision: Float[Tensor, "channel parameter parameter"],
+        precision: Float[Tensor, "*sequence channel parameter parameter"],
         linear: Float[Tensor, "sequence channel parameter"],
     ) -> Population:
         """Posterior given likelihoods exp(−½ θᵀAθ + bᵀθ) of every channel."""
@@ -38,7 +38,8 @@ class Population:
         shared = _times(solved.keep @ self.factors, solved.shared_mean[..., None, :])
         mean = self.mean + _times(solved.gain, solved.error) + shared
         root = torch.linalg.solve_triangular(solved.shared_root, solved.eye, upper=False).mT
-        return Population(mean, solved.keep @ self.factors @ root, solved.private)
+        factors = solved.keep @ self.factors @ root.unsqueeze(-3)
+        return Population(mean, factors, solved.private)
 
     def log_evidence(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,21 @@ from zoo.inference.tempering import learning_rate
 from zoo.strategies import Svi
 from zoo.types import Batch
 
-__all__ = ["NotFiniteError", "Steps"]
+__all__ = ["Advances", "NotFiniteError", "Steps"]
+
+
+@runtime_checkable
+class Advances(Protocol):
+    """A model or guide whose objective depends on the share of the training that is behind.
+
+    ``settled`` says that the objective is the final one; only then epochs are selected.
+    """
+
+    settled: bool
+
+    def advance(self, done: float) -> None:
+        """Take the objective of the share ``done``, from 0 to 1, and of it alone."""
+        ...
 
 
 class NotFiniteError(ArithmeticError):
@@ -51,6 +66,7 @@ class Steps:
     ) -> tuple[float, ...]:
         """One step; loss, reconstruction, KL and gradient norm, weighted by the batch's size."""
         self.noise("step", place.step, tries)
+        self.advance(place.step / self.count)
         for parameter in self.parameters.values():
             parameter.grad = None
         terms = tight_bound(self.model, self.guide, batch, c=c, beta=beta)
@@ -77,6 +93,7 @@ class Steps:
     def plain_bound(self, loader: Loader) -> float:
         """The un-tempered bound per datum, on the same noise at every call."""
         self.mode(training=False)
+        self.advance(1.0)
         self.noise("validation")
         total = 0.0
         for batch in loader.sweep():
@@ -85,6 +102,16 @@ class Steps:
                 raise NotFiniteError(f"{', '.join(broken)} on the validation data")
             total += terms.elbo.item() * len(batch) / batch.total
         return total / loader.total
+
+    def advance(self, done: float) -> None:
+        """Tell model and guide how far the training is, if they have stages."""
+        for part in self._staged():
+            part.advance(done)
+
+    def settled(self, step: int) -> bool:
+        """Whether the objective at ``step`` is the final one."""
+        self.advance(step / self.count)
+        return all(part.settled for part in self._staged())
 
     def mode(self, *, training: bool) -> None:
         """Switch model and guide between training and evaluation."""
@@ -97,6 +124,9 @@ class Steps:
         torch.default_generator.manual_seed(seed)
         if self.device.type == "cuda":
             torch.cuda.manual_seed(seed)
+
+    def _staged(self) -> list[Advances]:
+        return [part for part in (self.model, self.guide) if isinstance(part, Advances)]
 
     def _clip(self, gradients: list[Tensor], length: float) -> None:
         if self.strategy.clip is not None and length > self.strategy.clip:

@@ -161,7 +161,7 @@ class _Training:
         if self.val is None or not due:
             return state.place.waited
         row["val_elbo"] = elbo = self.steps.plain_bound(self.val)
-        if min(row["c"], row["beta"]) < 1.0:
+        if min(row["c"], row["beta"]) < 1.0 or not self.steps.settled(state.place.step - 1):
             return 0
         if state.best is not None and elbo <= state.best.elbo:
             return state.place.waited + 1
@@ -188,6 +188,7 @@ class _Training:
             self.parts.put_modules(self.state.best_tensors)
         self.state.finished = True
         self._save()
+        self.steps.advance(1.0)
         if self.state.place.step >= SETTLED:
             self.steps.noise("collapse")
             rows = self.loader.order(0)[: self.strategy.batch_size]

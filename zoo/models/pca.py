@@ -98,7 +98,7 @@ class PCA(nn.Module):
 
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: z for every frame of every window, then x."""
-        f = self._factors()
+        f = self.factors()
         shape = [*batch.values.shape[:2], self.latent_dim]
         mask = True if batch.mask is None else batch.mask
         with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
@@ -116,7 +116,7 @@ class PCA(nn.Module):
     def log_evidence(self, batch: Batch) -> Float[Tensor, ""]:
         """log p(x_seen), summed over all frames of the batch."""
         mask = None if batch.mask is None else batch.mask.flatten(0, 1)
-        return self._factors().log_evidence(batch.values.flatten(0, 1), mask).sum()
+        return self.factors().log_evidence(batch.values.flatten(0, 1), mask).sum()
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(z_t | x_t), exact, shape (sequence, time, latent)."""
@@ -129,7 +129,7 @@ class PCA(nn.Module):
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(x̂_t | x_t) of a second observation of the same frame, exact."""
-        f = self._factors()
+        f = self.factors()
         mean, covariance = self._posterior(batch)
         spread = torch.einsum("di,stij,dj->std", f.loading, covariance, f.loading)
         z = dist.MultivariateNormal(mean, covariance).sample((draws,))
@@ -157,13 +157,14 @@ class PCA(nn.Module):
             tolerance=c.em_tolerance,
         )
 
-    def _factors(self) -> Factors:
+    def factors(self) -> Factors:
+        """W, μ and σ as they were learned."""
         if self.noise.numel() == 0:
             raise NotFittedError("pca has seen no data yet; call zoo.fit or condition first")
         return Factors(loading=self.loading, mean=self.mean, noise=self.noise)
 
     def _posterior(self, batch: Batch) -> tuple[Tensor, Tensor]:
         mask = None if batch.mask is None else batch.mask.flatten(0, 1)
-        mean, covariance = self._factors().posterior(batch.values.flatten(0, 1), mask)
+        mean, covariance = self.factors().posterior(batch.values.flatten(0, 1), mask)
         windows = batch.values.shape[:2]
         return mean.unflatten(0, windows), covariance.unflatten(0, windows)

@@ -1,0 +1,99 @@
+"""A point guide of movements whose latent paths are primitives: an encoder and a regression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from zoo.nn.mlp import Activation, mlp, widths
+from zoo.types import Batch, Layout
+
+__all__ = ["Config", "Imitated", "PointGuide"]
+
+
+class Imitated(Protocol):
+    """A model with a latent path ``y`` of whole movements and parameters ``theta`` of each."""
+
+    latent_dim: int
+
+    def imitate(
+        self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None
+    ) -> Float[Tensor, "window parameter latent"]:
+        """Parameters whose roll-out is nearest to a path where it was seen."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """``hidden`` layers of the encoder; ``corruption`` the share of inputs set to 0 in training.
+
+    ``corrupted`` is the share of the training that does so, from its begin.
+    """
+
+    hidden: int | tuple[int, ...] = (36, 20)
+    activation: Activation = "tanh"
+    corruption: float = 0.1
+    corrupted: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Refuse empty layers and shares that are none."""
+        widths(self.hidden)
+        if not 0 <= self.corruption < 1:
+            raise ValueError(f"corruption must be in [0, 1); got {self.corruption}")
+        if not 0 <= self.corrupted <= 1:
+            raise ValueError(f"corrupted must be in [0, 1]; got {self.corrupted}")
+
+
+class PointGuide(nn.Module):
+    """Points y_t = enc(x_t) and θ, the regression of the path y_{1:n}: one θ a demonstration.
+
+    A first share of the training is that of a denoising encoder: inputs are dropped and the rest is
+    divided by 1 − ``corruption``. Missing entries count as the training mean, 0; θ regards frames
+    of which anything was seen.
+    """
+
+    config_class: ClassVar[type] = Config
+
+    def __init__(self, layout: Layout, model: Imitated, config: Config) -> None:
+        """An encoder of the channels of ``layout`` into the latent space of ``model``."""
+        super().__init__()
+        self.config = config
+        self._model = (model,)
+        sizes = [len(layout.channels), *widths(config.hidden), model.latent_dim]
+        self.corrupt = nn.Dropout(0.0)
+        self.encoder = mlp(sizes, config.activation)
+        self.settled = True
+
+    def advance(self, done: float) -> None:
+        """Corrupt the inputs in the first share of all steps."""
+        self.settled = done >= self.config.corrupted
+        self.corrupt.p = 0.0 if self.settled else self.config.corruption
+
+    def forward(self, batch: Batch) -> None:
+        """Both latent sites as points."""
+        (model,) = self._model
+        y = self._encoded(batch.values, batch.mask)
+        seen = None if batch.mask is None else batch.mask.any(-1)
+        with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
+            pyro.sample("y", dist.Delta(y).to_event(2))
+            pyro.sample("theta", dist.Delta(model.imitate(y, seen)).to_event(2))
+
+    def encode(
+        self,
+        values: Float[Tensor, "*batch channel"],
+        mask: Bool[Tensor, "*batch channel"] | None = None,
+    ) -> torch.distributions.Normal:
+        """enc(x_t) of single frames, as a Gaussian of no width to speak of."""
+        y = self._encoded(values, mask)
+        return torch.distributions.Normal(y, torch.full_like(y, torch.finfo(y.dtype).tiny))
+
+    def _encoded(self, values: Tensor, mask: Tensor | None) -> Tensor:
+        seen = values if mask is None else torch.where(mask, values, 0.0)
+        y: Tensor = self.encoder(self.corrupt(seen))
+        return y

@@ -1,0 +1,278 @@
+"""Dynamic movement primitives in a deep autoencoder: `ae-dmp` and its relatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from zoo.dynamics.components import ramp
+from zoo.dynamics.imitator import Imitator
+from zoo.dynamics.population import Population, estimate
+from zoo.errors import NotFittedError
+from zoo.nn.mlp import Activation, mlp, widths
+from zoo.prediction import Predictive
+from zoo.types import Batch, Layout, Posterior
+
+__all__ = ["AeDmp", "Config"]
+
+PRIORS = {"normal": dist.Normal, "laplace": dist.Laplace}
+SHRINKAGE, FLOOR = 0.3, 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Settings of :class:`AeDmp`.
+
+    ``hidden`` are the layers from a frame to the latent space, mirrored in the decoder;
+    ``penalty`` is λ of (72), forces in units of αβ; ``pretraining`` the share of the training in
+    which the autoencoder learns alone, 1 for two stages that are never joined; ``prior`` and
+    ``prior_scale`` that of y, whose ``laplace`` has η = 1/``prior_scale`` in (73); ``chain`` the
+    steps k of §5.3.4; ``noise_std`` where σ starts, never below ``noise_floor``, in scaled units.
+    """
+
+    latent_dim: int = 5
+    hidden: int | tuple[int, ...] = (36, 20)
+    activation: Activation = "tanh"
+    kernels: int = 20
+    alpha: float | None = None
+    penalty: float = 1e-3
+    pretraining: float = 0.3
+    prior: Literal["normal", "laplace"] = "normal"
+    prior_scale: float = 1.0
+    chain: int = 4
+    noise_std: float = 0.3
+    noise_floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse settings without a meaning."""
+        widths(self.hidden)
+        for name, least in (("latent_dim", 1), ("kernels", 2), ("chain", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
+        for name in ("penalty", "prior_scale", "noise_std", "noise_floor"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+        if not 0 <= self.pretraining <= 1:
+            raise ValueError(f"pretraining must be in [0, 1]; got {self.pretraining}")
+
+
+class AeDmp(nn.Module):
+    r"""Movements that are one DMP each in the latent space of a denoising autoencoder.
+
+    With the encoded path y = enc(x), the roll-out ỹ = R θ of θ = (y₁, ẏ₁, g, w), and β = α/4::
+
+        θ ~ N(0, I),   y_t ~ N(0, 1) or Laplace(0, 1/η)                     (73)
+        x_t ~ N(g(ỹ_t), σ²),   f_target,t(y) ~ N(Ψ_t w, σ²/λ)
+
+    Minus the log joint times 2σ² is (72), beside the priors: its second term has the force (59)
+    that y needs, in units of αβ. θ is not a free parameter but the ridge regression of the encoded
+    path, so that a new demonstration needs no training. A first share of the training is that of
+    the autoencoder, x_t ~ N(g(y_t), σ²); ``ae-then-dmp`` ends there and rolls out what it found,
+    the non-integrated model of Table 2.
+
+    Thesis §5.2, (72), (73), §5.3.2; N. Chen, J. Bayer, S. Urban, P. van der Smagt, *Efficient
+    movement representation by embedding dynamic movement primitives in deep autoencoders*,
+    Humanoids 2015. Defaults: layers 50–36–20–5 and back, tanh (the thesis leaves it open),
+    20 kernels, λ = 1e-3, data in [−1, 1]. Latent path and networks are points: bands of
+    reconstructions and new movements hold the one σ of all channels alone, which is learned.
+    Forecasts and missing sections condition a Gaussian over the θ of the training movements on the
+    frames seen, with draws; after training on a single movement it is as wide as that movement's
+    own θ. Missing joints come from the chain of §5.3.4 without the DMP. Movements must have one
+    common length.
+    """
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float32
+
+    prior_mean: Tensor
+    prior_factors: Tensor
+    prior_private: Tensor
+    prior_noise: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """A model of movements of ``layout.frames`` frames, all of one length."""
+        super().__init__()
+        self.layout, self.config, self.frames = layout, config, _frames(layout)
+        self.latent_dim = config.latent_dim
+        self.imitator = Imitator(self.frames, config.kernels, config.alpha)
+        sizes = [config.latent_dim, *widths(config.hidden)[::-1], len(layout.channels)]
+        self.decoder = mlp(sizes, config.activation)
+        self.root = nn.Parameter(torch.tensor(config.noise_std**0.5))
+        self.settled = self.integrated = config.pretraining < 1
+        for name in ("prior_mean", "prior_factors", "prior_private", "prior_noise"):
+            self.register_buffer(name, torch.empty(0))
+
+    @property
+    def σ(self) -> Float[Tensor, ""]:
+        """The one standard deviation of all channels."""
+        return self.root.square() + self.config.noise_floor
+
+    def advance(self, done: float) -> None:
+        """Join autoencoder and DMP after the pre-training's share of all steps."""
+        joins = self.config.pretraining < 1
+        self.integrated = joins and done >= self.config.pretraining
+        self.settled = self.integrated or not joins
+
+    def forward(self, batch: Batch) -> None:
+        """The generative program of whole movements: (72) as a log joint, or its first stage."""
+        windows, time = self._whole(batch).shape[:2]
+        zero = batch.values.new_zeros(())
+        prior = PRIORS[self.config.prior](zero, zero + self.config.prior_scale)
+        weights = dist.Normal(zero, zero + 1.0)
+        θ_shape = [windows, self.config.kernels + 3, self.latent_dim]
+        with pyro.plate("windows", size=batch.total, subsample=torch.arange(windows)):
+            y = pyro.sample("y", prior.expand([windows, time, self.latent_dim]).to_event(2))
+            θ = pyro.sample("theta", weights.expand(θ_shape).to_event(2))
+            path = self.imitator.roll_out(θ) if self.integrated else y
+            x = dist.Normal(self.decoder(path), self.σ).mask(_all(batch.mask))
+            pyro.sample("x", x.to_event(2), obs=batch.values)
+            if self.integrated:
+                f, f_target = self.imitator.forces(y, θ)
+                force = dist.Normal(f, self.σ / self.config.penalty**0.5)
+                pyro.sample("f", force.mask(_steps(batch.mask)).to_event(2), obs=f_target)
+
+    def imitate(
+        self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None
+    ) -> Float[Tensor, "window parameter latent"]:
+        """θ of the roll-outs nearest to ``path`` where it was seen."""
+        return self.imitator.fit(path, seen)
+
+    def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Roll-outs ỹ of the movements in the latent space, without a spread."""
+        return Predictive(location=self.imitator.roll_out(self._imitated(batch, posterior))[None])
+
+    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """The movements rolled out by the DMP and decoded, p(x̂ | θ)."""
+        return self._decoded(self.imitator.roll_out(self._imitated(batch, posterior))[None])
+
+    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Missing joints by the chain of §5.3.4; missing frames by the DMP given those seen."""
+        y, seen = self._encoded(batch, posterior)
+        paths = self._completed(y, seen, self.frames, draws)
+        return self._decoded(torch.where(seen[..., None], y, paths))
+
+    def forecast(
+        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
+    ) -> Predictive:
+        """Roll-outs given the encoded frames seen; phase 0 is the first frame."""
+        y, seen = self._encoded(batch, posterior)
+        known = y.shape[1]
+        return self._decoded(self._completed(y, seen, known + horizon, draws)[:, :, known:])
+
+    def generate(
+        self,
+        batch: Batch,
+        posterior: Posterior | None,
+        *,
+        goal: Float[Tensor, "sequence channel"] | None,
+        duration: float,
+        onto: Batch | None,
+        start: int,
+        steps: int,
+        draws: int,
+    ) -> Predictive:
+        """Goal changes (§5.3.6, in latent space), other durations, and switching (89)."""
+        θ, length = self._imitated(batch, posterior), round((self.frames - 1) * duration) + 1
+        if goal is not None:
+            θ = self.imitator.aimed(θ, _need(posterior).encode(goal).mean)
+        if onto is None:
+            return self._decoded((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
+        η = ramp(length, start, steps)
+        here = self.imitator.design(length, duration=duration, weight=1 - η)
+        there = self.imitator.design(length, duration=duration, weight=η, begin=False)
+        path = here.to(θ) @ θ + there.to(θ) @ self._imitated(onto, posterior)
+        return self._decoded(path[None])
+
+    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
+        """Keep the Gaussian over the θ of the training movements and what the roll-outs leave."""
+        θ = self._imitated(batch, posterior).mT.double()
+        y, seen = self._encoded(batch, posterior)
+        apart = (y - self.imitator.roll_out(θ.mT).to(y)).square() * seen[..., None]
+        size = θ.square().mean((0, 1)) if len(θ) == 1 else torch.full_like(θ[0, 0], FLOOR)
+        known = estimate(θ, θ.new_zeros(()), SHRINKAGE, size)
+        self.prior_mean, self.prior_factors = known.mean.to(y), known.factors.to(y)
+        self.prior_private = known.private.to(y)
+        self.prior_noise = apart.sum((0, 1)) / seen.sum() + FLOOR**2
+
+    def _completed(
+        self,
+        y: Float[Tensor, "sequence time latent"],
+        seen: Bool[Tensor, "sequence time"],
+        length: int,
+        draws: int,
+    ) -> Float[Tensor, "sample sequence frame latent"]:
+        """Draws of the roll-outs of ``length`` frames given the latent frames seen."""
+        if not self.prior_mean.numel():
+            raise NotFittedError("ae-dmp knows no movements yet; train it by zoo.fit first")
+        design = self.imitator.design(length).to(y.device)
+        weight = pad(seen, (0, length - y.shape[1])).double()[..., None]
+        gram = design.mT @ (weight * design)
+        values = pad(y.double(), (0, 0, 0, length - y.shape[1]))
+        noise = self.prior_noise.double()[:, None]
+        linear = (design.mT @ (weight * values)).mT / noise
+        prior = (self.prior_mean, self.prior_factors, self.prior_private)
+        known = Population(*(part.double() for part in prior))
+        θ = known.condition(gram[:, None] / noise[..., None], linear).sample(draws)
+        return (design @ θ.mT).to(y)
+
+    def _encoded(
+        self, batch: Batch, posterior: Posterior | None
+    ) -> tuple[Float[Tensor, "sequence time latent"], Bool[Tensor, "sequence time"]]:
+        """Latent frames, missing joints filled by passing them k times; frames seen at all."""
+        guide, x = _need(posterior), batch.values
+        if batch.mask is None:
+            return guide.encode(x).mean, torch.ones_like(x[..., 0], dtype=torch.bool)
+        for _ in range(self.config.chain):
+            x = torch.where(batch.mask, x, self.decoder(guide.encode(x).mean))
+        return guide.encode(x).mean, batch.mask.any(-1)
+
+    def _imitated(self, batch: Batch, posterior: Posterior | None) -> Tensor:
+        self._whole(batch)
+        return _need(posterior).draw(batch, 1)["theta"][0]
+
+    def _whole(self, batch: Batch) -> Tensor:
+        if batch.values.shape[1] != self.frames:
+            raise ValueError(
+                f"movements have {batch.values.shape[1]} frames; this model was made for "
+                f"{self.frames}: a part of a movement can be forecast or imputed"
+            )
+        return batch.values
+
+    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        return Predictive(location=self.decoder(paths), noise=self.σ, joint=True)
+
+
+def _all(mask: Tensor | None) -> Tensor | bool:
+    return True if mask is None else mask
+
+
+def _steps(mask: Tensor | None) -> Tensor | bool:
+    """Steps whose target force needs no frame that is missing altogether."""
+    if mask is None:
+        return True
+    seen = mask.any(-1)
+    before = torch.cat([seen[:, :1], seen[:, :-2]], dim=1)
+    return (before & seen[:, :-1] & seen[:, 1:])[..., None]
+
+
+def _need(posterior: Posterior | None) -> Posterior:
+    if posterior is None:
+        raise TypeError("ae-dmp predicts through its guide; got no posterior")
+    return posterior
+
+
+def _frames(layout: Layout) -> int:
+    if layout.frames is None or layout.frames < 3:
+        raise ValueError(
+            "ae-dmp needs movements of one common length of at least 3 frames; got "
+            f"{'several lengths' if layout.frames is None else layout.frames}: "
+            "bring them to one by data.resampled(70) or data.windows(70)"
+        )
+    return layout.frames
