@@ -55,7 +55,7 @@ CATALOGUE = Registry(
         Entry(
             name="promp",
             summary="Probabilistic movement primitives: joint Gaussian of all weights, exact",
-            thesis="rival, §5.1",
+            thesis="rival, named in §6.1",
             model="zoo.models.promp:ProMP",
             guide=None,
             inference=Exact(),

@@ -7,14 +7,21 @@ from dataclasses import replace
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotFittedError
 from zoo.types import Batch
 
-__all__ = ["check_fitted", "moments", "movements_of", "observe", "seen_entries"]
+__all__ = [
+    "check_fitted",
+    "moments",
+    "movement_groups",
+    "movements_of",
+    "observe",
+    "seen_entries",
+]
 
 
 def movements_of(name: str, data: Sequences | Pairs, dtype: torch.dtype) -> Sequences:
@@ -26,6 +33,19 @@ def movements_of(name: str, data: Sequences | Pairs, dtype: torch.dtype) -> Sequ
         channel = data.channels[int(never.nonzero()[0])]
         raise ValueError(f"channel {channel} is missing in every frame; drop it")
     return replace(data, values=torch.where(data.mask, data.values, 0.0).to(dtype))
+
+
+def movement_groups(data: Sequences) -> Int[Tensor, " sequence"]:
+    """Number of the movement that every row was cut from: windows differ in ``start`` alone.
+
+    Without groups every row is a movement of its own.
+    """
+    names = [k for k in data.groups if k != "start"]
+    if not names:
+        return torch.arange(len(data))
+    numbers: dict[tuple[object, ...], int] = {}
+    rows = zip(*(data.groups[name] for name in names), strict=True)
+    return torch.tensor([numbers.setdefault(row, len(numbers)) for row in rows])
 
 
 def moments(values: Tensor, mask: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:

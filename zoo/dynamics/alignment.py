@@ -1,0 +1,66 @@
+"""Durations of movements, and tempo and phase of repeated ones by a common template."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from zoo.dynamics.rollout import Timing
+from zoo.dynamics.sums import Movements
+from zoo.dynamics.weights import Basis
+
+__all__ = ["BasisOf", "align", "possible"]
+
+BasisOf = Callable[[int, Timing], Basis]
+
+
+def align(
+    basis: BasisOf, movements: Movements, choices: Sequence[Timing], rounds: int = 3
+) -> list[Timing]:
+    """Timing of every movement, against the longest one first and then against all.
+
+    The template is the least-squares path of the movements as they lie; each movement takes the
+    choice whose template is nearest over the entries seen.
+    """
+    longest = max(range(len(movements)), key=lambda i: len(movements[i][0]))
+    timings, chosen = [choices[0]] * len(movements), [longest]
+    for _ in range(rounds):
+        pooled = [(movements[i], timings[i]) for i in chosen]
+        template = _template(basis, pooled)
+        timings = [choices[_nearest(basis, x, seen, choices, template)] for x, seen in movements]
+        chosen = list(range(len(movements)))
+    return timings
+
+
+def possible(kind: str, found: Sequence[Timing], count: int) -> list[Timing]:
+    """Timings that a new movement may have: all, or ``count`` of the durations of discrete ones.
+
+    >>> [t.unit for t in possible("discrete", [Timing(5.0), Timing(9.0), Timing(6.0)], 2)]
+    [5.0, 9.0]
+    """
+    if kind == "rhythmic":
+        return list(found)
+    units = sorted({t.unit for t in found})
+    ranks = torch.linspace(0, len(units) - 1, min(count, len(units))).round().int().tolist()
+    return [Timing(units[rank]) for rank in ranks]
+
+
+def _template(
+    basis: BasisOf, pooled: Sequence[tuple[tuple[Tensor, Tensor], Timing]]
+) -> Float[Tensor, " weight"]:
+    parts = [(basis(len(x), timing), x, seen) for (x, seen), timing in pooled]
+    total = torch.stack([b.precision(seen.to(x)) for b, x, seen in parts]).sum(0)
+    linear = torch.stack([b.linear(x * seen) for b, x, seen in parts]).sum(0)
+    ridge = 1e-6 * total.diagonal().mean() * torch.eye(len(total), dtype=total.dtype)
+    template: Tensor = torch.linalg.solve(total + ridge, linear)
+    return template
+
+
+def _nearest(
+    basis: BasisOf, x: Tensor, seen: Tensor, choices: Sequence[Timing], template: Tensor
+) -> int:
+    paths = torch.stack([basis(len(x), choice).path(template) for choice in choices])
+    return int(((x - paths) * seen).square().sum((1, 2)).argmin())

@@ -1,0 +1,145 @@
+r"""Gaussian over the weights of whole movements, jointly over all channels.
+
+A movement is linear in one weight vector w of basis functions and synergies::
+
+    w ~ N(μ, Σ),   y_tc = Σ_jk S_cj φ_k(t) w_jk,   x_tc ~ N(y_tc, σ_c²)
+
+so that every set of seen entries is a Gaussian likelihood exp(−½ wᵀAw + bᵀw).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from zoo.dynamics.components import Paths
+
+__all__ = ["Basis", "Weights", "superposed"]
+
+
+@dataclass(frozen=True)
+class Basis:
+    """φ of every frame and the synergies S, by which the weights act on the channels."""
+
+    phases: Float[Tensor, "time kernel"]
+    synergies: Float[Tensor, "channel synergy"]
+
+    def path(self, w: Float[Tensor, "*batch weight"]) -> Float[Tensor, "*batch time channel"]:
+        """y of weight vectors.
+
+        >>> Basis(torch.eye(3), torch.tensor([[1.0], [2.0]])).path(torch.tensor([0.0, 1.0, 5.0])).mT
+        tensor([[ 0.,  1.,  5.],
+                [ 0.,  2., 10.]])
+        """
+        table = w.unflatten(-1, (self.synergies.shape[1], self.phases.shape[1]))
+        y: Tensor = (self.synergies @ table @ self.phases.mT).mT
+        return y
+
+    def precision(self, weight: Float[Tensor, "time channel"]) -> Float[Tensor, "weight weight"]:
+        """A of entries that count ``weight``, 1/σ² where they were seen and 0 elsewhere."""
+        s, φ = self.synergies, self.phases
+        gram = torch.einsum("tc,ci,cj->tij", weight, s, s).flatten(1)
+        kernel = (φ[:, :, None] * φ[:, None, :]).flatten(1)
+        blocks = (gram.mT @ kernel).view(s.shape[1], s.shape[1], φ.shape[1], φ.shape[1])
+        return blocks.transpose(1, 2).flatten(2).flatten(0, 1)
+
+    def linear(
+        self, weighted: Float[Tensor, "*batch time channel"]
+    ) -> Float[Tensor, "*batch weight"]:
+        """B of values that were multiplied by their weights: the adjoint of :meth:`path`."""
+        linear: Tensor = self.synergies.mT @ weighted.mT @ self.phases
+        return linear.flatten(-2)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """N(mean, root rootᵀ); ``mean`` may have leading axes, all with the same covariance."""
+
+    mean: Float[Tensor, "*sequence weight"]
+    root: Float[Tensor, "weight rank"]
+
+    @property
+    def covariance(self) -> Float[Tensor, "weight weight"]:
+        """Σ."""
+        covariance: Tensor = self.root @ self.root.mT
+        return covariance
+
+    def condition(
+        self, precision: Float[Tensor, "weight weight"], linear: Float[Tensor, "sequence weight"]
+    ) -> Weights:
+        """Posterior given the likelihoods exp(−½ wᵀAw + bᵀw)."""
+        root = self._posterior_root(self._inner(precision))
+        error = linear - self.mean @ precision
+        return Weights(self.mean + (error @ root) @ root.mT, root)
+
+    def log_evidence(
+        self, precision: Float[Tensor, "weight weight"], linear: Float[Tensor, "sequence weight"]
+    ) -> Float[Tensor, " sequence"]:
+        """Log of the likelihood, integrated over w."""
+        inner = self._inner(precision)
+        error = linear - self.mean @ precision
+        at_mean = (self.mean * (linear + error)).sum(-1) / 2
+        white = torch.linalg.solve_triangular(inner, (error @ self.root).mT, upper=False)
+        volume = inner.diagonal().log().sum()
+        evidence: Tensor = at_mean + white.square().sum(0) / 2 - volume
+        return evidence
+
+    def affine(self, matrix: Float[Tensor, "weight weight"], shift: Tensor) -> Weights:
+        """The distribution of matrix w + shift."""
+        return Weights(self.mean @ matrix.mT + shift, matrix @ self.root)
+
+    def moved(
+        self, basis: Basis, goal: Float[Tensor, " channel"], metric: Float[Tensor, "weight weight"]
+    ) -> Weights:
+        """w + ΣHᵀ(HΣHᵀ)⁺ (0, g − y_T): nearest in ``metric`` Σ, with the same first frame."""
+        eye = torch.eye(len(metric), dtype=metric.dtype, device=metric.device)
+        ends = basis.path(eye)[:, [0, -1]].flatten(1).mT
+        inner = torch.linalg.pinv(ends @ metric @ ends.mT, rtol=1e-9, hermitian=True)
+        gain = (metric @ ends.mT @ inner)[:, len(goal) :]
+        return self.affine(eye - gain @ ends[len(goal) :], gain @ goal)
+
+    def centred(self, basis: Basis, goal: Float[Tensor, " channel"]) -> Weights:
+        """Every synergy's weights about a new centre: those of a basis whose rows sum to one."""
+        kernels, synergies = basis.phases.shape[1], basis.synergies.shape[1]
+        alike = goal.new_full((kernels, kernels), 1 / kernels)
+        middle = torch.kron(torch.eye(synergies, dtype=goal.dtype), alike)
+        keep = torch.eye(len(middle), dtype=goal.dtype) - middle
+        centre = torch.linalg.pinv(basis.synergies) @ goal
+        return self.affine(keep, centre.repeat_interleave(kernels))
+
+    def moments(
+        self, basis: Basis
+    ) -> tuple[Float[Tensor, "*sequence time channel"], Float[Tensor, "time channel"]]:
+        """Mean of y, and its variance."""
+        return basis.path(self.mean), basis.path(self.root.mT).square().sum(0)
+
+    def sample(self, count: int) -> Float[Tensor, "sample *sequence weight"]:
+        """Draws of w, from torch's default generator."""
+        shape = (count, *self.mean.shape[:-1], self.root.shape[-1])
+        ε = torch.randn(shape, dtype=self.mean.dtype, device=self.mean.device)
+        return self.mean + ε @ self.root.mT
+
+    def _inner(self, precision: Tensor) -> Tensor:
+        """Cholesky factor of I + rootᵀ A root."""
+        eye = torch.eye(self.root.shape[-1], dtype=self.root.dtype, device=self.root.device)
+        factor: Tensor = torch.linalg.cholesky(eye + self.root.mT @ precision @ self.root)
+        return factor
+
+    def _posterior_root(self, inner: Tensor) -> Tensor:
+        turned: Tensor = torch.linalg.solve_triangular(inner, self.root.mT, upper=False)
+        return turned.mT
+
+
+def superposed(terms: Sequence[tuple[Basis, Weights, Float[Tensor, " time"]]], draws: int) -> Paths:
+    """Sum of independent paths, each counting a part at every frame."""
+    parts = [(basis, weights, part[:, None]) for basis, weights, part in terms]
+    moments = [weights.moments(basis) for basis, weights, _ in parts]
+    mean = sum(p * m for (_, _, p), (m, _) in zip(parts, moments, strict=True))
+    variance = sum(p.square() * v for (_, _, p), (_, v) in zip(parts, moments, strict=True))
+    path = sum(p * basis.path(weights.sample(draws)) for basis, weights, p in parts)
+    centre = torch.as_tensor(mean)
+    return Paths(centre, torch.as_tensor(variance).expand_as(centre), torch.as_tensor(path))
