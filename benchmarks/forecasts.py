@@ -67,11 +67,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", choices=DATA)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--models", nargs="*", help="only these entries (default: all that can)")
     chosen = parser.parse_args()
     loader, label = DATA[chosen.data]
     parts = loader().split(by="trial", parts=SHARES, seed=chosen.seed)
     rows = []
-    for name in zoo.list_models(can="forecast"):
+    for name in chosen.models or zoo.list_models(can="forecast"):
         rows.append(judged(name, parts, chosen.seed))
         rmse, coverage = rows[-1]["scores"]["rmse"], rows[-1]["scores"]["coverage_90"]
         print(
@@ -79,7 +80,8 @@ def main() -> None:
             f"{coverage[1]:.1f}  {rows[-1]['seconds']:.0f} s",
             flush=True,
         )
-    command = f"python -m benchmarks.forecasts {chosen.data}"
+    named = f" --models {' '.join(chosen.models)}" if chosen.models else ""
+    command = f"python -m benchmarks.forecasts {chosen.data}{named}"
     cards = [
         {
             "model": row["model"],
