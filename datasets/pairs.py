@@ -44,6 +44,15 @@ class Pairs:
     name: str = "pairs"
     provenance: str = "public"
 
+    def __repr__(self) -> str:
+        """Sizes, targets, units and groups in one line."""
+        units = "/".join(dict.fromkeys(u for u in self.units if u)) or "no unit"
+        return (
+            f"Pairs {self.name!r} ({self.provenance}): {len(self)} items of {len(self.features)} "
+            f"features, {len(self.channels)} targets in {units}, "
+            f"groups {', '.join(self.groups) or 'none'}"
+        )
+
     @classmethod
     def from_arrays(
         cls,

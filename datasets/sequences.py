@@ -57,6 +57,17 @@ class Sequences:
     name: str = "sequences"
     provenance: str = "public"
 
+    def __repr__(self) -> str:
+        """Sizes, channels, units, rate and groups in one line."""
+        lengths = sorted(set(self.lengths.tolist()))
+        frames = f"{lengths[0]}–{lengths[-1]}" if len(lengths) > 1 else f"{lengths[0]}"
+        units = "/".join(dict.fromkeys(u for u in self.units if u)) or "no unit"
+        return (
+            f"Sequences {self.name!r} ({self.provenance}): {len(self)} movements of {frames} "
+            f"frames at {self.rate:g} Hz, {len(self.channels)} channels in {units}, "
+            f"groups {', '.join(self.groups) or 'none'}"
+        )
+
     @classmethod
     def from_arrays(
         cls,

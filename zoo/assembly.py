@@ -41,6 +41,15 @@ class Assembly:
     seed: int
     device: str
 
+    def __repr__(self) -> str:
+        """Entry, layout and settings in one line."""
+        given = "".join(f", {k}={v!r}" for k, v in self.settings.items())
+        return (
+            f"Assembly of {self.entry.name} for {len(self.layout.channels)} channels or targets: "
+            f"{self.parameters()} parameters, {type(self.inference).__name__}, "
+            f"seed={self.seed}{given}"
+        )
+
     @property
     def dtype(self) -> torch.dtype:
         """Number type that the model computes in."""

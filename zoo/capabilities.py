@@ -8,7 +8,7 @@ at frame 0 (``batch.start == 0``); what a forecast has seen is exactly ``batch.v
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -22,6 +22,7 @@ __all__ = [
     "Imputes",
     "Reconstructs",
     "Regresses",
+    "Reports",
     "Represents",
 ]
 
@@ -93,5 +94,18 @@ class Generates(Protocol):
 
         Switching goes from ``batch`` to the movements ``onto``, from frame ``start`` over
         ``steps`` frames, (89).
+        """
+        ...
+
+
+@runtime_checkable
+class Reports(Protocol):
+    """What was learned, in words and numbers."""
+
+    def report(self) -> dict[str, Any]:
+        """Plain values by name, in the model's scale.
+
+        Those with ``_std`` in their name hold a standard deviation for each target or channel; the
+        run brings them to the data's units.
         """
         ...

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
-
-if TYPE_CHECKING:
-    from zoo.datasets.records import Pairs, Sequences
-    from zoo.run import Run
 
 __all__ = ["app", "main"]
 
@@ -37,6 +34,10 @@ Data = Annotated[
     str | None,
     typer.Option("--data", help="Data set by name (see `zoo data`); default: the model's own."),
 ]
+Unseen = Annotated[
+    str | None,
+    typer.Option("--data", help="Data set by name (see `zoo data`); default: the run's test part."),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", help="KEY=VALUE, a setting of the model; repeatable (see `zoo card`)."),
@@ -48,7 +49,7 @@ Figure = Annotated[Path | None, typer.Option("--figure", help="Write a figure to
 
 @app.command("list")
 def list_command(
-    pattern: Annotated[str, typer.Argument(help="Glob, e.g. '*dmp*'.")] = "*",
+    pattern: Annotated[str, typer.Argument(help="Glob, e.g. `'*dmp*'`.")] = "*",
     can: Annotated[str | None, typer.Option("--can", help="Only models with this task.")] = None,
     json: Json = False,
     markdown: Annotated[bool, typer.Option(help="Print the table as Markdown.")] = False,
@@ -113,7 +114,10 @@ def fit(
     calibrate: Annotated[str, typer.Option(help="conformal, isotonic, scale or none.")] = (
         "conformal"
     ),
-    resume: Annotated[bool, typer.Option(help="Continue from a checkpoint in the folder.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint there.")] = (
+        False
+    ),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run there.")] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
     json: Json = False,
 ) -> None:
@@ -121,29 +125,40 @@ def fit(
 
     Example: `zoo fit vae-dmp --data cmu-mocap/35-walk --set latent_dim=5 --run-dir runs/walk`
     """
+    from zoo.console import print_json, report_table
+    from zoo.run import evaluate as score
     from zoo.workflow import Plan, train
 
     plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device)
-    with _interruptible():
-        run = train(plan, run_dir, resume=resume, progress=not json)
-    _report(run, plan.load()[3], json=json)
-    if not json:
-        Console().print(f"Run written to [bold]{run_dir}[/]; next: zoo evaluate {run_dir}")
+    advice = "repeat the command with --resume to go on from the last checkpoint, if there is one"
+    with _interruptible(advice):
+        run = train(plan, run_dir, resume=resume, overwrite=overwrite, progress=not json)
+    test = plan.load()[3]
+    if json:
+        print_json(score(run, test).to_json() | {"report": run.report()})
+        return
+    if run.report():
+        Console().print(report_table(run))
+    Console().print(score(run, test))
+    Console().print(f"Run written to [bold]{run_dir}[/]; next: zoo evaluate {run_dir}")
 
 
 @app.command()
 def evaluate(
     run_dir: Folder,
-    data: Data = None,
+    data: Unseen = None,
     task: Annotated[list[str] | None, typer.Option(help="Only this task; repeatable.")] = None,
     figure: Figure = None,
     json: Json = False,
 ) -> None:
     """Scores of a run on its test part, or on all of another data set: errors and calibration."""
+    from zoo.console import print_json
+    from zoo.run import evaluate as score
     from zoo.workflow import open_run, reliability_figure
 
     run, test = open_run(run_dir, data)
-    _report(run, test, json=json, tasks=task)
+    table = score(run, test, tasks=task)
+    print_json(table.to_json()) if json else Console().print(table)
     if figure is not None:
         reliability_figure(run, test, figure)
 
@@ -151,7 +166,7 @@ def evaluate(
 @app.command()
 def forecast(
     run_dir: Folder,
-    data: Data = None,
+    data: Unseen = None,
     seen: Annotated[int | None, typer.Option(help="Frames shown to the model.")] = None,
     horizon: Annotated[int | None, typer.Option(help="Frames to forecast.")] = None,
     output: Annotated[Path | None, typer.Option(help="Write mean and bands to this CSV.")] = None,
@@ -188,28 +203,23 @@ def experiment(
         listing = {k: e.summary for k, e in EXPERIMENTS.items()}
         print_json(listing) if json else Console().print(data_table(listing))
         return
-    with _interruptible():
+    with _interruptible("repeat the command to go on from the last checkpoint"):
         result = run_experiment(identifier, output, quick=quick, progress=not json)
     print_json(result.to_json()) if json else Console().print(result)
 
 
-def _report(
-    run: Run, test: Pairs | Sequences, *, json: bool, tasks: list[str] | None = None
-) -> None:
-    from zoo.console import print_json
-    from zoo.run import evaluate as score
-
-    table = score(run, test, tasks=tasks)
-    print_json(table.to_json()) if json else Console().print(table)
-
-
 @contextmanager
-def _interruptible() -> Iterator[None]:
+def _interruptible(advice: str) -> Iterator[None]:
     try:
         yield
-    except KeyboardInterrupt:
-        print("zoo: interrupted; repeat the command with --resume to go on", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        where = str(stop).partition(";")[0] or "interrupted"
+        print(f"zoo: {where}; {advice}", file=sys.stderr)
         raise typer.Exit(130) from None
+
+
+def _warn(message: Warning | str, *_: object) -> None:
+    print(f"zoo: warning: {message}", file=sys.stderr)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -217,7 +227,9 @@ def main(arguments: list[str] | None = None) -> int:
     from zoo.errors import DamagedRunError, TrainingError
 
     try:
-        app(arguments)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn  # type: ignore[assignment]
+            app(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)
     except (DamagedRunError, TrainingError, OSError, FloatingPointError) as error:

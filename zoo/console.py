@@ -7,12 +7,21 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from zoo.datasets.records import Pairs, Sequences
     from zoo.registry import Entry
+    from zoo.run import Run
 
-__all__ = ["data_table", "describe", "models_markdown", "models_table", "print_json"]
+__all__ = [
+    "data_table",
+    "describe",
+    "models_markdown",
+    "models_table",
+    "print_json",
+    "report_table",
+]
 
 
 def print_json(value: Any) -> None:
@@ -48,10 +57,23 @@ def data_table(rows: Mapping[str, Any] | Sequence[str]) -> Table:
     table = Table(box=None, show_header=False)
     if isinstance(rows, Mapping):
         for key, value in rows.items():
-            table.add_row(f"[bold]{key}[/]", str(value))
+            inner = value.items() if isinstance(value, Mapping) else ()
+            text = "\n".join(f"{k}: {v}" for k, v in inner) if inner else str(value)
+            table.add_row(f"[bold]{key}[/]", Text(text))
     else:
         for name in rows:
             table.add_row(name)
+    return table
+
+
+def report_table(run: Run) -> Table:
+    """What the model learned, a line each; standard deviations in the data's units."""
+    table = Table(title=f"learned by {run.name}", box=None, show_header=False, title_justify="left")
+    layout = run.assembly.layout
+    units = " ".join(dict.fromkeys(u for u in layout.units if u))
+    for name, value in run.report().items():
+        unit = units if "_std" in name else ""
+        table.add_row(f"[bold]{name.replace('_', ' ')}[/]", _shortened(_numbers(value)), unit)
     return table
 
 
@@ -61,9 +83,10 @@ def describe(data: Pairs | Sequences) -> dict[str, Any]:
     description: dict[str, Any] = {"name": data.name, "provenance": data.provenance}
     if layout.kind == "sequences":
         lengths = data.lengths.tolist()  # type: ignore[union-attr]
+        several = len(set(lengths)) > 1
         description |= {
             "movements": len(data),
-            "frames": f"{min(lengths)}–{max(lengths)}",
+            "frames": f"{min(lengths)}–{max(lengths)}" if several else str(lengths[0]),
             "rate": _rate(data),  # type: ignore[arg-type]
         }
     else:
@@ -77,6 +100,13 @@ def describe(data: Pairs | Sequences) -> dict[str, Any]:
     if notes := getattr(data, "notes", ()):
         description["notes"] = "; ".join(notes)
     return description
+
+
+def _numbers(value: Any) -> list[str]:
+    """A value, or all of a list of lists, to four digits."""
+    if isinstance(value, list):
+        return [number for part in value for number in _numbers(part)]
+    return [f"{value:.4g}" if isinstance(value, float) else str(value)]
 
 
 def _rate(data: Sequences) -> str:

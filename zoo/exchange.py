@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from zoo.assembly import Assembly
+from zoo.capabilities import Reports
 from zoo.datasets.records import Pairs, Sequences
 from zoo.datasets.scaling import Scaler
 from zoo.inference.loader import whole
@@ -20,7 +22,7 @@ from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.prediction import Predictive
 from zoo.types import Batch, Posterior
 
-__all__ = ["Answer", "Exchange", "fingerprints"]
+__all__ = ["Answer", "Exchange", "check_timing", "fingerprints", "question"]
 
 Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
 
@@ -75,6 +77,18 @@ class Exchange:
                 frames[rows] = parts[-1][1].location.shape[2]
         return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled)), frames
 
+    def report(self) -> dict[str, Any]:
+        """What the model tells of itself, its standard deviations in the data's units."""
+        model = self.assembly.model
+        if not isinstance(model, Reports):
+            return {}
+        scale = self.scaler.channel_scale.double().cpu()
+        return {
+            name: (torch.tensor(value) * scale).tolist() if "_std" in name else value
+            for name, value in model.report().items()
+            if value != []
+        }
+
     def goal(self, goal: ArrayLike, count: int) -> Tensor:
         """A last frame to reach, for each of ``count`` movements, in the model's scale."""
         layout = self.assembly.layout
@@ -124,6 +138,33 @@ class Exchange:
             channels=layout.channels,
             units=layout.units,
         )
+
+
+def check_timing(like: Sequences, duration: float, switches: bool, start: int, steps: int) -> None:
+    """Refuse a duration without frames, and a switch outside the new movement."""
+    if not 0 < duration < math.inf:
+        raise ValueError(f"duration must be positive and finite; got {duration}")
+    shortest = int(like.lengths.min())
+    frames = round((shortest - 1) * duration) + 1
+    if frames < 3:
+        raise ValueError(
+            f"duration={duration:g} leaves {frames} of {shortest} frames; at least 3 are needed"
+        )
+    if not switches and (start, steps) != (0, 1):
+        raise ValueError("start and steps are those of a switch: name the movements to go onto")
+    if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
+        raise ValueError(
+            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
+        )
+
+
+def question(task: str, data: Sequences) -> str:
+    """Name under which a task's recalibration is kept: imputation of joints or of a section."""
+    if task != "impute":
+        return task
+    inside = torch.arange(data.values.shape[1]) < data.lengths[:, None]
+    section = bool((inside & ~data.mask.any(-1)).any())
+    return "impute section" if section else "impute joints"
 
 
 def fingerprints(data: Pairs | Sequences) -> list[str]:

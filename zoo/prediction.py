@@ -77,6 +77,14 @@ class Prediction:
         if self.lengths is not None and tuple(self.lengths.shape) != shape[:1]:
             raise ValueError(f"{len(self.lengths)} lengths for {shape[0]} {self.axes[0]}s")
 
+    def __repr__(self) -> str:
+        """Task, named sizes, units and recalibration in one line."""
+        sizes = ", ".join(f"{a} {n}" for a, n in zip(self.axes, self.shape, strict=True))
+        units = "/".join(dict.fromkeys(u for u in self.units if u)) or "no unit"
+        spread = "with spread" if self.has_spread else "without spread"
+        kind = "" if self.recalibration is None else f", {type(self.recalibration).__name__}"
+        return f"Prediction of {self.task}: {sizes}; in {units}, {spread}{kind}"
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Sizes of the axes."""

@@ -67,7 +67,7 @@ class Registry:
         if name not in self._entries:
             near = difflib.get_close_matches(name, self._entries, n=3, cutoff=0.4)
             hint = f"; did you mean {' or '.join(near)}?" if near else ""
-            raise UnknownNameError(f"no model {name!r}{hint} (zoo.list_models() names all)")
+            raise UnknownNameError(f"no model {name!r}{hint} (`zoo list` names all)")
         return self._entries[name]
 
     def __iter__(self) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -22,7 +21,7 @@ from zoo.errors import NotCapableError
 from zoo.evaluation.calibration import recalibrate
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
-from zoo.exchange import Answer, Exchange, fingerprints
+from zoo.exchange import Answer, Exchange, check_timing, fingerprints, question
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.inference.train import Session, train_model
@@ -50,6 +49,15 @@ class Run:
     seconds: float
     trained_on: dict[str, Any]
     recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Model, data and training in one line."""
+        tasks = ", ".join(self.recalibrations) or "nothing"
+        return (
+            f"Run of {self.name} on {self.trained_on['name']!r}: {len(self.history)} epochs or "
+            f"iterations in {self.seconds:.1f} s; can {', '.join(self.capabilities)}; "
+            f"calibrated for {tasks}"
+        )
 
     @property
     def name(self) -> str:
@@ -148,7 +156,7 @@ class Run:
         of the new movement over ``steps`` frames, (89).
         """
         generate = self._capability("generate")
-        _check_timing(like, duration, onto is not None, start, steps)
+        check_timing(like, duration, onto is not None, start, steps)
         target = None if goal is None else self.exchange.goal(goal, len(like))
         other = None if onto is None else self.exchange.onto(onto, len(like))
 
@@ -182,6 +190,13 @@ class Run:
                     method, trial.prediction.raw, trial.truth, trial.mask, trial.groups
                 )
         return self
+
+    def report(self) -> dict[str, Any]:
+        """What the model says of its learned parameters; empty where it says nothing.
+
+        Standard deviations (``…_std…``) are in the data's units, one for each target or channel.
+        """
+        return self.exchange.report()
 
     def save(self, folder: str | Path) -> Path:
         """Write the run as a folder of safetensors and JSON."""
@@ -217,7 +232,7 @@ class Run:
             task=task,
             rate=layout.rate,
             lengths=frames,
-            recalibration=self.recalibrations.get(_question(task, data)),
+            recalibration=self.recalibrations.get(question(task, data)),
         )
 
     def _check_unseen(self, data: Pairs | Sequences, purpose: str) -> None:
@@ -225,8 +240,8 @@ class Run:
         again = sum(f in known for f in fingerprints(data))
         if again:
             warnings.warn(
-                f"{again} of {len(data)} movements or items given for {purpose} were trained on; "
-                "spreads on them look better than they are",
+                f"{again} of {len(data)} movements or items given for {purpose} were trained on "
+                "(these or equal ones); spreads on them look better than they are",
                 stacklevel=3,
             )
 
@@ -305,30 +320,3 @@ def load(folder: str | Path) -> Run:
     from zoo.storage import load_run
 
     return load_run(Path(folder))
-
-
-def _check_timing(like: Sequences, duration: float, switches: bool, start: int, steps: int) -> None:
-    """Refuse a duration without frames, and a switch outside the new movement."""
-    if not 0 < duration < math.inf:
-        raise ValueError(f"duration must be positive and finite; got {duration}")
-    shortest = int(like.lengths.min())
-    frames = round((shortest - 1) * duration) + 1
-    if frames < 3:
-        raise ValueError(
-            f"duration={duration:g} leaves {frames} of {shortest} frames; at least 3 are needed"
-        )
-    if not switches and (start, steps) != (0, 1):
-        raise ValueError("start and steps are those of a switch: name the movements to go onto")
-    if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
-        raise ValueError(
-            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
-        )
-
-
-def _question(task: str, data: Sequences) -> str:
-    """Name under which a task's recalibration is kept: imputation of joints or of a section."""
-    if task != "impute":
-        return task
-    inside = torch.arange(data.values.shape[1]) < data.lengths[:, None]
-    section = bool((inside & ~data.mask.any(-1)).any())
-    return "impute section" if section else "impute joints"

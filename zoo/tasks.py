@@ -13,7 +13,16 @@ from zoo.datasets.records import Groups, Pairs, Sequences
 from zoo.errors import UnknownNameError
 from zoo.prediction import Prediction
 
-__all__ = ["TASKS", "Predictor", "Setup", "Trial", "hide_joints", "hide_section", "trials"]
+__all__ = [
+    "TASKS",
+    "Predictor",
+    "Setup",
+    "Trial",
+    "beginning",
+    "hide_joints",
+    "hide_section",
+    "trials",
+]
 
 _Record = TypeVar("_Record", Pairs, Sequences)
 
@@ -53,12 +62,19 @@ class Setup:
     draws: int = 200
     seed: int = 0
 
-    def frames(self, data: Sequences) -> tuple[int, int]:
-        """Frames seen and frames to forecast; by default a seventh is seen (10 of 70)."""
+    def frames(self, data: Sequences, *, beyond: bool = False) -> tuple[int, int]:
+        """Frames seen and frames to forecast; by default a seventh is seen (10 of 70).
+
+        The forecast ends where the shortest movement does, unless it may go ``beyond``.
+        """
         shortest = int(data.lengths.min())
         seen = max(2, shortest // 7) if self.seen is None else self.seen
         horizon = shortest - seen if self.horizon is None else self.horizon
-        if seen < 1 or horizon < 1 or seen + horizon > shortest:
+        if seen < 1 or seen > shortest:
+            raise ValueError(f"a forecast sees 1 to {shortest} frames of these data; got {seen}")
+        if horizon < 1:
+            raise ValueError(f"a forecast needs a horizon of at least 1 frame; got {horizon}")
+        if seen + horizon > shortest and not beyond:
             raise ValueError(
                 f"a forecast of {horizon} frames after {seen} needs {seen + horizon} frames; "
                 f"the shortest movement has {shortest}"
@@ -98,9 +114,7 @@ def _reconstruct(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial
 def _forecast(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
     movements = _expect(data, Sequences)
     seen, horizon = setup.frames(movements)
-    known = movements.frames(0, seen)
-    if movements.controls is not None:
-        known = replace(known, controls=movements.controls[:, : seen + horizon])
+    known = beginning(movements, seen, horizon)
     prediction = run.forecast(known, horizon=horizon, draws=setup.draws, seed=setup.seed)
     future = movements.frames(seen, seen + horizon)
     return _trial("forecast", prediction, future, future.mask)
@@ -145,6 +159,14 @@ def trials(
             )
         names = list(tasks)
     return [TASKS[name][1](run, data, setup or Setup()) for name in names]
+
+
+def beginning(data: Sequences, seen: int, horizon: int) -> Sequences:
+    """What a forecast may see: the first frames, and the controls of those to come as well."""
+    known = data.frames(0, seen)
+    if data.controls is None:
+        return known
+    return replace(known, controls=data.controls[:, : seen + horizon])
 
 
 def hide_joints(data: Sequences, share: float, *, seed: int = 0) -> Sequences:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,13 +18,15 @@ from zoo.catalogue import CATALOGUE
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError, NotCapableError
+from zoo.evaluation.answers import clusters
 from zoo.prediction import Prediction
 from zoo.run import Run, fit, load
-from zoo.tasks import Setup, trials
+from zoo.tasks import Setup, beginning, trials
 
 __all__ = ["ForecastReport", "Plan", "forecast_report", "open_run", "reliability_figure", "train"]
 
 _PLAN = "plan.json"
+_WORDS = {"none": None, "null": None, "true": True, "false": False}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +35,7 @@ class Plan:
 
     model: str
     data: str
-    settings: dict[str, str]
+    settings: dict[str, Any]
     by: str | None
     parts: tuple[float, ...]
     seed: int
@@ -73,12 +76,38 @@ class Plan:
         train, val, calib, test = data.split(by=by, parts=self.parts, seed=self.seed)
         return train, val, calib, test
 
+    @classmethod
+    def kept(cls, folder: Path) -> Plan | None:
+        """The plan that a folder's training followed."""
+        path = folder / _PLAN
+        if not path.is_file():
+            return None
+        try:
+            saved = json.loads(path.read_text(encoding="utf-8"))
+            return cls(**{**saved, "parts": tuple(saved["parts"])})
+        except (ValueError, TypeError, KeyError) as error:
+            raise DamagedRunError(f"{path} is not a plan of `zoo fit`: {error}") from None
 
-def train(plan: Plan, folder: Path, *, resume: bool = False, progress: bool = False) -> Run:
-    """Fit, calibrate and save as planned."""
+
+def train(
+    plan: Plan,
+    folder: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: bool = False,
+) -> Run:
+    """Fit, calibrate and save as planned.
+
+    A folder that holds a training is taken only to ``resume`` it, by the same plan, or to
+    ``overwrite`` it.
+    """
     train, val, calib, _ = plan.load()
     assembly = create(plan.model, train, seed=plan.seed, device=plan.device, **plan.settings)
+    _check_free(folder, plan, resume, overwrite)
     folder.mkdir(parents=True, exist_ok=True)
+    if not resume:
+        archive.clear(folder, "run")
     archive.replace_file(folder / _PLAN, json.dumps(asdict(plan), indent=1).encode())
     run = fit(
         assembly,
@@ -88,10 +117,41 @@ def train(plan: Plan, folder: Path, *, resume: bool = False, progress: bool = Fa
         resume="auto" if resume else "never",
         progress=progress,
     )
-    if plan.calibrate != "none":
+    if plan.calibrate != "none" and _enough(calib):
         run.calibrate(calib, method=plan.calibrate)  # type: ignore[arg-type]
         run.save(folder)
     return run
+
+
+def _enough(calib: Pairs | Sequences) -> bool:
+    count = len(clusters(calib.groups, len(calib)).unique())
+    if count < 2:
+        warnings.warn(
+            f"the calibration part holds {count} movement or item and at least 2 are needed: "
+            "spreads stay as the model gives them (more data, or other --parts)",
+            stacklevel=3,
+        )
+    return count >= 2
+
+
+def _check_free(folder: Path, plan: Plan, resume: bool, overwrite: bool) -> None:
+    if overwrite and resume:
+        raise ValueError("--resume goes on with a training, --overwrite replaces it: choose one")
+    if overwrite:
+        return
+    if not resume and any(archive.exists(folder, stem) for stem in ("run", "checkpoint")):
+        raise ValueError(
+            f"{folder} holds a training already: --resume to go on with it, --overwrite to replace "
+            "it, or another --run-dir"
+        )
+    kept = Plan.kept(folder) if resume else None
+    for name in ("model", "data", "settings", "by", "parts", "seed"):
+        was, new = getattr(kept, name, None), getattr(plan, name)
+        if kept is not None and was != new:
+            raise ValueError(
+                f"{folder} was begun with {name} {was!r}, now it is {new!r}: repeat its own words, "
+                "or choose another --run-dir"
+            )
 
 
 def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:
@@ -99,11 +159,9 @@ def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:
     run = load(folder)
     if data is not None:
         return run, load_data(data)
-    path = folder / _PLAN
-    if not path.is_file():
+    plan = Plan.kept(folder)
+    if plan is None:
         raise DamagedRunError(f"{folder} holds no {_PLAN}: name a data set with --data")
-    saved = json.loads(path.read_text(encoding="utf-8"))
-    plan = Plan(**{**saved, "parts": tuple(saved["parts"])})
     return run, plan.load()[3]
 
 
@@ -161,12 +219,15 @@ def forecast_report(
     output: Path | None = None,
     figure: Path | None = None,
 ) -> ForecastReport:
-    """Forecast all movements after their first frames; write and draw what was asked for."""
+    """Forecast all movements after their first frames; write and draw what was asked for.
+
+    The forecast may go on beyond the last frame known.
+    """
     if "forecast" not in run.capabilities:
         raise NotCapableError(f"{run.name} cannot forecast; it can {', '.join(run.capabilities)}")
     setup = Setup(seen=seen, horizon=horizon)
-    first, ahead = setup.frames(data)
-    prediction = run.forecast(data.first(first), horizon=ahead)
+    first, ahead = setup.frames(data, beyond=True)
+    prediction = run.forecast(beginning(data, first, ahead), horizon=ahead)
     report = ForecastReport(prediction=prediction, seen=first, groups=data.groups)
     if output is not None:
         _write_csv(output, report.rows())
@@ -179,7 +240,8 @@ def forecast_figure(prediction: Prediction, data: Sequences, seen: int, path: Pa
     """Draw the bands of the channels that move most, for the first movement."""
     from zoo.evaluation.figures import forecast_bands
 
-    forecast_bands(prediction, data.values, seen=seen).savefig(path, dpi=150)
+    figure = forecast_bands(prediction, data.values, seen=seen, mask=data.mask)
+    figure.savefig(path, dpi=150)
 
 
 def reliability_figure(run: Run, data: Pairs | Sequences, path: Path) -> None:
@@ -187,14 +249,25 @@ def reliability_figure(run: Run, data: Pairs | Sequences, path: Path) -> None:
     from zoo.evaluation.figures import reliability
 
     answers = [t for t in trials(run, data) if t.prediction.has_spread]
-    reliability({t.task: (t.prediction, t.truth, t.mask) for t in answers}).savefig(path, dpi=150)
+    lines = {t.task: (t.prediction, t.truth, t.mask, t.groups) for t in answers}
+    reliability(lines).savefig(path, dpi=150)
 
 
-def _setting(word: str) -> tuple[str, str]:
+def _setting(word: str) -> tuple[str, Any]:
     key, equals, value = word.partition("=")
     if not equals or not key:
         raise ValueError(f"--set takes KEY=VALUE; got {word!r}")
-    return key.strip().replace("-", "_"), value.strip()
+    return key.strip().replace("-", "_"), _value(value.strip())
+
+
+def _value(word: str) -> Any:
+    """A number, several with commas, true, false, none, or the word itself."""
+    if word.lower() in _WORDS:
+        return _WORDS[word.lower()]
+    try:
+        return json.loads(f"[{word}]" if "," in word and not word.startswith("[") else word)
+    except ValueError:
+        return word
 
 
 def _shares(words: str) -> tuple[float, ...]:

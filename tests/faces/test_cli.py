@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from support import pairs
 
+import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.cli import main
 
@@ -101,3 +106,117 @@ def test_forecast_writes_bands(
     assert all(float(r["low_90"]) <= float(r["mean"]) <= float(r["high_90"]) for r in rows)
     assert figure.read_bytes().startswith(b"\x89PNG")
     assert "90 % band" in capsys.readouterr().out
+
+
+def test_a_forecast_may_go_beyond_what_is_known(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["forecast", str(run_folder), "--seen", "70", "--horizon", "10", "--json"]
+    assert main([*words, "--figure", str(tmp_path / "bands.png")]) == 0
+    assert {r["frame"] for r in json.loads(capsys.readouterr().out)} == set(range(70, 80))
+    assert main(["forecast", str(run_folder), "--seen", "0"]) == 2
+    assert "sees 1 to 76 frames" in capsys.readouterr().err
+
+
+def test_a_folder_is_not_overwritten_by_accident(
+    run_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {f.name: f.read_bytes() for f in run_folder.iterdir()}
+    words = ["fit", "dmp", "--data", "robot-arm/reaching", "--run-dir", str(run_folder)]
+    assert main(words) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert main([*words, "--resume", "--set", "kernels=7"]) == 2
+    assert "begun with settings {}" in capsys.readouterr().err
+    assert main(["fit", "mean", *words[2:], "--resume"]) == 2
+    assert "begun with model 'dmp'" in capsys.readouterr().err
+    assert main([*words, "--resume", "--overwrite"]) == 2
+    assert {f.name: f.read_bytes() for f in run_folder.iterdir()} == before
+
+
+def test_overwriting_and_resuming_are_said_aloud(tmp_path: Path) -> None:
+    words = ["fit", "mean", "--data", "robot-arm", "--run-dir", str(tmp_path), "--json"]
+    assert main([*words, "--calibrate", "none"]) == 0
+    assert main([*words, "--calibrate", "none", "--resume"]) == 0
+    other = ["fit", "last-value", *words[2:], "--calibrate", "none", "--overwrite"]
+    assert main(other) == 0
+    assert zoo.load(tmp_path).name == "last-value"
+
+
+@pytest.mark.filterwarnings("default::UserWarning")
+def test_too_few_movements_to_calibrate_on_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fit", "mean", "--data", "robot-arm", "--run-dir", str(tmp_path)]) == 0
+    error = capsys.readouterr().err
+    assert "zoo: warning: the calibration part holds 1 movement" in error and ".py" not in error
+    assert zoo.load(tmp_path).recalibrations == {}
+
+
+def test_settings_are_numbers_lists_and_words(tmp_path: Path) -> None:
+    words = ["fit", "vae", "--data", "robot-arm", "--run-dir", str(tmp_path), "--json"]
+    sets = ["epochs=1", "hidden=8,4", "clip=none", "noise=shared", "learning_rate=1e-3"]
+    assert main([*words, "--calibrate", "none", *(w for s in sets for w in ("--set", s))]) == 0
+    assembly = zoo.load(tmp_path).assembly
+    assert assembly.model.config.hidden == (8, 4) and assembly.model.config.noise == "shared"
+    assert assembly.inference.clip is None and assembly.inference.learning_rate == 1e-3
+
+
+@pytest.mark.filterwarnings("default::zoo.errors.NoiseDivergenceWarning")
+def test_fitc_prints_both_noise_levels(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("zoo.workflow.load_data", lambda name: pairs())
+    words = ["fit", "fitc", "--data", "tiny", "--run-dir", str(tmp_path), "--set", "inducing=20"]
+    words += ["--calibrate", "none"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "noise std " in out and "noise std vfe" in out and "learned by fitc" in out
+    assert main([*words, "--resume", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)["report"]
+    assert report == zoo.load(tmp_path).report()
+
+
+def test_a_report_is_in_the_units_of_the_data() -> None:
+    data = pairs()
+    run = zoo.fit(zoo.create("gp", data, iterations=20), data)
+    louder = zoo.run.replace(data, targets=10 * data.targets)
+    again = zoo.fit(zoo.create("gp", louder, iterations=20), louder)
+    ratio = np.array(again.report()["noise_std"]) / np.array(run.report()["noise_std"])
+    np.testing.assert_allclose(ratio, 10.0, rtol=1e-6)
+    lengths = [np.array(r.report()["length_scale"]) for r in (run, again)]
+    np.testing.assert_allclose(*lengths)
+    assert zoo.fit(zoo.create("mean-regressor", data), data).report() == {}
+
+
+def test_an_interrupted_fit_says_so_and_goes_on(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", "import sys; from zoo.cli import main; sys.exit(main())"]
+    words += ["fit", "vae", "--data", "robot-arm", "--run-dir", str(tmp_path), "--json"]
+    words += ["--calibrate", "none", "--set", "epochs=20000", "--set", "checkpoint_every=1"]
+    words += ["--set", "patience=none"]
+    handler = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    words[2] = f"{handler}; {words[2]}"
+    training = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    _wait_for(tmp_path / "checkpoint.json", training)
+    training.send_signal(signal.SIGINT)
+    _, error = training.communicate(timeout=60)
+    assert training.returncode == 130
+    assert "interrupted in epoch" in error and "--resume" in error and "Traceback" not in error
+    assert json.loads((tmp_path / "checkpoint.json").read_text())
+
+
+def _wait_for(file: Path, training: subprocess.Popen[str]) -> None:
+    for _ in range(600):
+        if file.exists() or training.poll() is not None:
+            return
+        time.sleep(0.1)
+
+
+def test_what_python_shows_of_things_is_a_line() -> None:
+    data = zoo.load_data("robot-arm/reaching", movements=6)
+    run = zoo.fit(zoo.create("dmp", data), data)
+    prediction = run.forecast(data.first(10), horizon=4)
+    for thing in (data, pairs(), run.assembly, run, prediction):
+        text = repr(thing)
+        assert len(text) < 250 and "tensor" not in text and "\n" not in text
+    assert "6 movements of 76 frames at 25 Hz" in repr(data)
+    assert "Prediction of forecast: sequence 6, time 4, channel 6; in rad" in repr(prediction)
