@@ -26,7 +26,7 @@ from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.inference.train import Session, train_model
 from zoo.prediction import Prediction, Predictive, Recalibration
-from zoo.tasks import Setup, Trial, trials
+from zoo.tasks import Setup, trials
 from zoo.types import Batch, Posterior
 
 __all__ = ["Run", "create", "evaluate", "fit", "load"]
@@ -51,12 +51,11 @@ class Run:
     recalibrations: dict[str, Recalibration] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Model, data and training in one line."""
-        tasks = ", ".join(self.recalibrations) or "nothing"
+        """Model, data, tasks and calibration in one line."""
+        calibrated = ", ".join(self.recalibrations) or "nothing"
         return (
-            f"Run of {self.name} on {self.trained_on['name']!r}: {len(self.history)} epochs or "
-            f"iterations in {self.seconds:.1f} s; can {', '.join(self.capabilities)}; "
-            f"calibrated for {tasks}"
+            f"Run of {self.name} on {self.trained_on['name']!r}: "
+            f"can {', '.join(self.capabilities)}; calibrated for {calibrated}"
         )
 
     @property
@@ -310,8 +309,8 @@ def evaluate(
 ) -> Table:
     """Score every task that the model can do, or those named, on data it never saw."""
     run._check_unseen(data, "evaluation")
-    rows: list[tuple[str, Trial]] = [(t.task, t) for t in trials(run, data, tasks, setup)]
-    scores = [(task, score(t.prediction, t.truth, t.mask, t.groups)) for task, t in rows]
+    posed = trials(run, data, tasks, setup)
+    scores = [(t.task, score(t.prediction, t.truth, t.mask, t.groups)) for t in posed]
     return Table.of(run.name, data.name, scores)
 
 
