@@ -9,6 +9,7 @@ from zoo.strategies import Exact, MarginalLikelihood, Svi
 
 __all__ = ["CATALOGUE", "list_models"]
 
+_AE_DMP = Svi(window=None, epochs=3000, batch_size=16, learning_rate=1e-2, clip=100.0)
 _VAE_DMP = Svi(
     window=10,
     epochs=1500,
@@ -61,6 +62,52 @@ CATALOGUE = Registry(
             inference=Exact(),
             data="sequences",
             dataset="robot-arm/reaching",
+        ),
+        Entry(
+            name="pca-dmp",
+            summary="Principal components, then one movement primitive for each, exact",
+            thesis="Table 2",
+            model="zoo.models.pca_dmp:PcaDmp",
+            guide=None,
+            inference=Exact(),
+            data="sequences",
+            dataset="thesis-movements",
+            scaling="center",
+        ),
+        Entry(
+            name="ae-dmp",
+            summary="Dynamic movement primitives in the latent space of a denoising autoencoder",
+            thesis="§5.2.1, (72)",
+            model="zoo.models.ae_dmp:AeDmp",
+            guide="zoo.guides.point:PointGuide",
+            inference=_AE_DMP,
+            data="sequences",
+            dataset="thesis-movements",
+            scaling="range",
+        ),
+        Entry(
+            name="sparse-ae-dmp",
+            summary="AE-DMP with a Laplace prior on the latent path",
+            thesis="§5.2.2, (73)",
+            model="zoo.models.ae_dmp:AeDmp",
+            guide="zoo.guides.point:PointGuide",
+            inference=_AE_DMP,
+            data="sequences",
+            dataset="thesis-movements",
+            scaling="range",
+            config={"prior": "laplace", "prior_scale": 0.3},
+        ),
+        Entry(
+            name="ae-then-dmp",
+            summary="An autoencoder, then movement primitives in its latent space, not integrated",
+            thesis="§5.3.2, Table 2",
+            model="zoo.models.ae_dmp:AeDmp",
+            guide="zoo.guides.point:PointGuide",
+            inference=_AE_DMP,
+            data="sequences",
+            dataset="thesis-movements",
+            scaling="range",
+            config={"pretraining": 1.0},
         ),
         Entry(
             name="vae",

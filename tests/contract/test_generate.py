@@ -53,7 +53,8 @@ def test_goals_are_one_for_all_or_one_for_each(name: str) -> None:
 
 @pytest.mark.parametrize("name", DISCRETE)
 def test_the_goal_is_reached(name: str) -> None:
-    goals = movements().values[:3, -1] + 0.3
+    apart = movements().values[3:6, -1] - movements().values[:3, -1]
+    goals = movements().values[:3, -1] + 3 * apart  # where joints go together: few components do
     error = (generated(name, goal=goals.numpy()).mean[:, -1] - goals).abs().max()
     before = (generated(name).mean[:, -1] - goals).abs().max()
     assert float(error) < 0.2 * float(before)

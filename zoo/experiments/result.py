@@ -89,6 +89,10 @@ class Result:
 
 
 EXPERIMENTS: dict[str, Experiment] = {
+    "E5.1": Experiment(
+        summary="five movements by AE-DMP, its parts apart, DMP and PCA-DMP, against Table 2",
+        module="zoo.experiments.e5_1",
+    ),
     "E6.1": Experiment(
         summary="five movements in one VAE-DMP and each in its own, against Table 2 and Fig. 45",
         module="zoo.experiments.e6_1",
