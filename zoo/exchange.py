@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,7 @@ from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.prediction import Predictive
 from zoo.types import Batch, Posterior
 
-__all__ = ["Answer", "Exchange", "check_timing", "fingerprints", "question"]
+__all__ = ["Answer", "Exchange", "check_timing", "check_unseen", "fingerprints", "question"]
 
 Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
 
@@ -176,6 +177,18 @@ def fingerprints(data: Pairs | Sequences) -> list[str]:
         lengths = data.lengths.tolist()
         rows = ((v[:n],) for v, n in zip(_doubles(data.values), lengths, strict=True))
     return [_digest(*row) for row in rows]
+
+
+def check_unseen(data: Pairs | Sequences, trained_on: Sequence[str], purpose: str) -> None:
+    """Warn where movements or items, or their equals, were trained on."""
+    known = set(trained_on)
+    again = sum(f in known for f in fingerprints(data))
+    if again:
+        warnings.warn(
+            f"{again} of {len(data)} movements or items given for {purpose} were trained on "
+            "(these or equal ones); spreads on them look better than they are",
+            stacklevel=3,
+        )
 
 
 def _doubles(values: Tensor) -> NDArray[np.float64]:

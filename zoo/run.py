@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from zoo.errors import NotCapableError
 from zoo.evaluation.calibration import recalibrate
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
-from zoo.exchange import Answer, Exchange, check_timing, fingerprints, question
+from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.inference.train import Session, train_model
@@ -182,7 +181,7 @@ class Run:
         setup: Setup | None = None,
     ) -> Run:
         """Fit and keep a correction of every spread on movements that training never saw."""
-        self._check_unseen(data, "calibration")
+        check_unseen(data, self.trained_on["fingerprints"], "calibration")
         for trial in trials(self, data, tasks, setup):
             if trial.prediction.has_spread:
                 self.recalibrations[trial.task] = recalibrate(
@@ -233,16 +232,6 @@ class Run:
             lengths=frames,
             recalibration=self.recalibrations.get(question(task, data)),
         )
-
-    def _check_unseen(self, data: Pairs | Sequences, purpose: str) -> None:
-        known = set(self.trained_on["fingerprints"])
-        again = sum(f in known for f in fingerprints(data))
-        if again:
-            warnings.warn(
-                f"{again} of {len(data)} movements or items given for {purpose} were trained on "
-                "(these or equal ones); spreads on them look better than they are",
-                stacklevel=3,
-            )
 
 
 def fit(
@@ -308,7 +297,7 @@ def evaluate(
     setup: Setup | None = None,
 ) -> Table:
     """Score every task that the model can do, or those named, on data it never saw."""
-    run._check_unseen(data, "evaluation")
+    check_unseen(data, run.trained_on["fingerprints"], "evaluation")
     posed = trials(run, data, tasks, setup)
     scores = [(t.task, score(t.prediction, t.truth, t.mask, t.groups)) for t in posed]
     return Table.of(run.name, data.name, scores)
