@@ -30,7 +30,7 @@ CATALOGUE = Registry(
             guide="zoo.guides.exact:ExactPosterior",
             inference=Exact(),
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
         ),
         Entry(
             name="dmp",
@@ -117,7 +117,7 @@ CATALOGUE = Registry(
             guide="zoo.guides.amortised:Amortised",
             inference=Svi(window=1, epochs=500),
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
             config={"noise": "constant"},
         ),
         Entry(
@@ -138,7 +138,7 @@ CATALOGUE = Registry(
             guide="zoo.guides.filtering:FilteringGuide",
             inference=_VAE_DMP,
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
             scaling="center",
         ),
         Entry(
