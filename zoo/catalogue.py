@@ -110,6 +110,17 @@ CATALOGUE = Registry(
             config={"pretraining": 1.0},
         ),
         Entry(
+            name="promp-rhythmic",
+            summary="Probabilistic movement primitives on a circle, tempo and phase found",
+            thesis="rival, named in §6.1",
+            model="zoo.models.promp:ProMP",
+            guide=None,
+            inference=Exact(),
+            data="sequences",
+            dataset="cmu-mocap/35-walk",
+            config={"kind": "rhythmic", "kernels": 12, "synergies": 8},
+        ),
+        Entry(
             name="vae",
             summary="Variational autoencoder of single frames",
             thesis="§2.1.5.3, §4.3.1",

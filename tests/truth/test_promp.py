@@ -248,6 +248,10 @@ def test_settings_without_a_meaning_are_refused(settings, message):
         Config(**settings)
 
 
-def test_synergies_must_be_fewer_than_the_channels():
-    with pytest.raises(ValueError, match="below the number of channels, 3"):
-        ProMP(layout(), Config(synergies=3))
+def test_as_many_synergies_as_channels_are_the_channels():
+    _, data, _ = drawn(6)
+    models = [ProMP(data.layout, Config(kernels=KERNELS, synergies=n)) for n in (None, 3)]
+    for model in models:
+        model.condition(data)
+    assert torch.equal(models[0].mean, models[1].mean)
+    assert torch.equal(models[1].synergies, torch.eye(3, dtype=torch.float64))

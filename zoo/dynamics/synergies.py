@@ -16,14 +16,16 @@ def synergies_of(
     mask: Bool[Tensor, "sequence time channel"],
     count: int | None,
 ) -> tuple[Float[Tensor, "channel synergy"], Float[Tensor, " channel"]]:
-    """Loading and mean of the principal components of all frames; None: every channel alone.
+    """Loading and mean of the principal components of all frames.
+
+    Every channel stands alone where ``count`` is None or not below their number.
 
     >>> synergies, mean = synergies_of(torch.zeros(1, 5, 3), torch.ones(1, 5, 3).bool(), None)
     >>> synergies.shape, mean.shape
     (torch.Size([3, 3]), torch.Size([3]))
     """
-    if count is None:
-        channels = values.shape[2]
+    channels = values.shape[2]
+    if count is None or count >= channels:
         return torch.eye(channels, dtype=values.dtype), values.new_zeros(channels)
     frames, seen = values[mask.any(-1)], mask[mask.any(-1)]
     if bool(seen.all()):

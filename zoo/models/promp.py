@@ -1,4 +1,4 @@
-"""Probabilistic movement primitives: `promp`."""
+"""Probabilistic movement primitives: `promp`, `promp-rhythmic`."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ COMPONENTS = 16
 class Config:
     """Settings of :class:`ProMP`.
 
-    ``kernels`` basis functions for every synergy; ``synergies`` is their number, None takes every
-    channel as its own. ``period`` of rhythmic movements is in s; None finds it by autocorrelation.
+    ``kernels`` basis functions for every synergy; ``synergies`` is their number, and every channel
+    is its own where that is None or not below the number of channels. ``period`` of rhythmic
+    movements is in s; None finds it by autocorrelation.
     ``shrinkage`` is the share of the inverse-Wishart prior in Σ; None chooses it by the density of
     movements left out. EM ends after ``em_iterations`` or a gain of ``em_tolerance`` nats an entry.
     """
@@ -104,14 +105,8 @@ class ProMP(nn.Module):
     offsets: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
-        """Placeholders until :meth:`condition`; ``synergies`` must be below the channels."""
+        """Placeholders until :meth:`condition`."""
         super().__init__()
-        channels = len(layout.channels)
-        if config.synergies is not None and config.synergies >= channels:
-            raise ValueError(
-                f"synergies must be below the number of channels, {channels}, or None for all; "
-                f"got {config.synergies}"
-            )
         self.layout, self.config = layout, config
         names = ("mean", "root", "noise", "synergies", "offset", "shrinkage", "units", "offsets")
         for name in names:
