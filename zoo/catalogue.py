@@ -9,7 +9,7 @@ from zoo.strategies import Exact, MarginalLikelihood, Svi
 
 __all__ = ["CATALOGUE", "list_models"]
 
-_AE_DMP = Svi(window=None, epochs=3000, batch_size=16, learning_rate=1e-2, clip=100.0)
+_AE_DMP = Svi(window=None, epochs=3000, learning_rate=1e-2, clip=100.0, max_steps=10_000)
 _VAE_DMP = Svi(
     window=10,
     epochs=1500,
@@ -71,7 +71,7 @@ CATALOGUE = Registry(
             guide=None,
             inference=Exact(),
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
             scaling="center",
         ),
         Entry(
@@ -82,7 +82,7 @@ CATALOGUE = Registry(
             guide="zoo.guides.point:PointGuide",
             inference=_AE_DMP,
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
             scaling="range",
         ),
         Entry(
@@ -93,7 +93,7 @@ CATALOGUE = Registry(
             guide="zoo.guides.point:PointGuide",
             inference=_AE_DMP,
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
             scaling="range",
             config={"prior": "laplace", "prior_scale": 0.3},
         ),
@@ -105,7 +105,7 @@ CATALOGUE = Registry(
             guide="zoo.guides.point:PointGuide",
             inference=_AE_DMP,
             data="sequences",
-            dataset="thesis-movements",
+            dataset="robot-arm/reaching",
             scaling="range",
             config={"pretraining": 1.0},
         ),
