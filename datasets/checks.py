@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 
 import numpy as np
 import torch
@@ -82,6 +82,8 @@ def group_columns(
     if groups is None:
         return {default: tuple(str(i) for i in range(count))}
     for key, column in groups.items():
+        if not isinstance(column, Sized):
+            raise TypeError(f"group column {key!r} needs {count} rows, in a list; got {column!r}")
         if len(column) != count:
             raise ValueError(f"group column {key!r} has {len(column)} rows for {count} {what}")
     return {key: tuple(str(v) for v in column) for key, column in groups.items()}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Self
 
 import numpy as np
@@ -96,8 +98,8 @@ class Sequences:
         parts = [matrix(a, f"sequence {i}") for i, a in enumerate(arrays)]
         if not parts:
             raise ValueError("arrays is empty; at least one sequence is needed")
-        if not rate > 0:
-            raise ValueError(f"rate must be positive, in Hz; got {rate}")
+        if not isinstance(rate, Real) or not 0 < rate < math.inf:
+            raise ValueError(f"rate must be a positive number, in Hz; got {rate!r}")
         names = distinct_names(channels, parts[0].shape[1], "channel")
         values, mask, lengths = pad(parts, len(names), "channels")
         known = None if controls is None else pad_controls(controls, lengths)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zoo.datasets.records import Pairs
+from zoo.datasets.split import nearest
 from zoo.datasets.store import FileFormatError, require
 
 __all__ = ["load"]
@@ -70,13 +71,14 @@ class _Folder:
     folder: str | Path | None
 
     def path(self, name: str) -> Path:
+        meant = "" if self.what in COLUMNS else nearest(self.what, COLUMNS)
         return require(
             f"{self.what}/{name}",
             dataset="uci",
             folder=self.folder,
             advice=f"get the data set and its splits as published with Hernández-Lobato & Adams "
             f"(2015) and put its text files into $MOVEZOO_DATA/uci/{self.what}/ "
-            "or name their folder with folder=...",
+            f"or name their folder with folder=...{meant}",
         )
 
     def table(self, name: str) -> NDArray[np.float64]:

@@ -125,3 +125,8 @@ def test_absent_splits_and_folders_say_how_to_get_them(tmp_path: Path) -> None:
         zoo.load_data("uci/own", folder=uci(tmp_path), split=11)
     with pytest.raises(MissingDataError, match=r"put its text files into \$MOVEZOO_DATA/uci/boats"):
         zoo.load_data("uci/boats", folder=tmp_path / "none")
+
+
+def test_a_misspelt_member_of_a_family_is_recognised(tmp_path: Path) -> None:
+    with pytest.raises(MissingDataError, match=r"concret/data.txt is not in .* mean concrete\?"):
+        zoo.load_data("uci/concret", folder=tmp_path)

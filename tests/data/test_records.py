@@ -232,3 +232,14 @@ def test_select_and_where() -> None:
         ValueError, match="nothing matches subject=7; the data have subject: 35, 49"
     ):
         data.where(subject=7)
+
+
+@pytest.mark.parametrize("rate", [0, -1.0, float("nan"), float("inf"), "fast"])
+def test_a_rate_that_is_none_is_refused(rate: object) -> None:
+    with pytest.raises(ValueError, match="rate must be a positive number, in Hz; got"):
+        Sequences.from_arrays([np.zeros((5, 2))], rate=rate)  # type: ignore[arg-type]
+
+
+def test_a_group_column_is_a_list() -> None:
+    with pytest.raises(TypeError, match="group column 'subject' needs 2 rows, in a list; got 3"):
+        Sequences.from_arrays(np.zeros((2, 5, 2)), rate=1.0, groups={"subject": 3})  # type: ignore[dict-item]
