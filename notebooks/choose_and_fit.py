@@ -36,7 +36,8 @@ train, val, calib, test = data.split(by="trial", parts=(0.6, 0.1, 0.15, 0.15), s
 figure = plt.figure(figsize=(9, 3.2), layout="constrained")
 seconds = np.arange(data.values.shape[1]) / data.rate
 for axes, joint in zip(figure.subplots(1, 3, sharex=True), (0, 1, 2), strict=True):
-    axes.plot(seconds, np.rad2deg(data.values[:30, :, joint].T.numpy()), color="C0", alpha=0.35, lw=1)
+    degrees = np.rad2deg(data.values[:30, :, joint].T.numpy())
+    axes.plot(seconds, degrees, color="C0", alpha=0.35, lw=1)
     axes.set(title=data.channels[joint], xlabel="time / s", ylabel="angle / °")
 figure.suptitle(f"30 of {len(data)} reaching movements, {data.provenance}")
 plt.show()
