@@ -169,7 +169,7 @@ def forecast(
     data: Unseen = None,
     seen: Annotated[int | None, typer.Option(help="Frames shown to the model.")] = None,
     horizon: Annotated[int | None, typer.Option(help="Frames to forecast.")] = None,
-    output: Annotated[Path | None, typer.Option(help="Write mean and bands to this CSV.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Write mean and bands: .csv or .nc.")] = None,
     figure: Figure = None,
     json: Json = False,
 ) -> None:

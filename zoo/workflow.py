@@ -230,7 +230,7 @@ def forecast_report(
     prediction = run.forecast(beginning(data, first, ahead), horizon=ahead)
     report = ForecastReport(prediction=prediction, seen=first, groups=data.groups)
     if output is not None:
-        _write_csv(output, report.rows())
+        _write(output, report)
     if figure is not None:
         forecast_figure(prediction, data, first, figure)
     return report
@@ -278,6 +278,16 @@ def _shares(words: str) -> tuple[float, ...]:
     if len(shares) != 4:
         raise ValueError(f"--parts takes four shares (train,val,calib,test); got {len(shares)}")
     return shares
+
+
+def _write(path: Path, report: ForecastReport) -> None:
+    """CSV, or NetCDF where the file is named so."""
+    if path.suffix != ".nc":
+        _write_csv(path, report.rows())
+        return
+    from zoo.evaluation.labelled import dataset
+
+    dataset(report.prediction, report.groups).to_netcdf(path, engine="h5netcdf")
 
 
 def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

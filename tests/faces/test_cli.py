@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from support import pairs
 
 import zoo
@@ -106,6 +107,16 @@ def test_forecast_writes_bands(
     assert all(float(r["low_90"]) <= float(r["mean"]) <= float(r["high_90"]) for r in rows)
     assert figure.read_bytes().startswith(b"\x89PNG")
     assert "90 % band" in capsys.readouterr().out
+
+
+def test_forecast_writes_labelled_arrays(run_folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "bands.nc"
+    words = ["forecast", str(run_folder), "--seen", "10", "--horizon", "20", "--json"]
+    assert main([*words, "--output", str(output)]) == 0
+    with xarray.open_dataset(output, engine="h5netcdf") as bands:
+        assert dict(bands.sizes)["time"] == 20
+        assert bool((bands.lower <= bands.upper).all())
+        assert set(bands.unit.values.tolist()) == {"rad"}
 
 
 def test_a_forecast_may_go_beyond_what_is_known(
