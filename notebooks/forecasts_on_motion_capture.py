@@ -65,7 +65,7 @@ prediction = run.forecast(test.first(seen), horizon=horizon)
 forecast_bands(prediction, test.values, seen=seen)
 
 # %% [markdown]
-# Grey: what the model saw. Line and bands: mean, 50 % and 90 % of the forecast. Black: what came.
+# Solid black: what the model saw. Blue: mean, 50 % and 90 % band of the forecast. Dashed: truth.
 #
 # ## Is the promise kept?
 #
@@ -79,13 +79,15 @@ after = run.forecast(test.first(seen), horizon=horizon)
 future = test.frames(seen, seen + horizon)
 reliability(
     {
-        "as trained": (before, future.values, future.mask),
-        "recalibrated": (after, future.values, future.mask),
+        "as trained": (before, future.values, future.mask, future.groups),
+        "recalibrated": (after, future.values, future.mask, future.groups),
     }
 )
 
 # %% [markdown]
-# On the diagonal the bands hold what they promise. Now against what a sceptic would use: the
+# On the diagonal the bands hold what they promise **on average over all joints and lead times**: a
+# fast joint may still leave its band more often than a slow one. The bars are two standard errors
+# over trials, of which there are few. Now against what a sceptic would use: the
 # mean of the training movements, the last value, an autoregression, the nearest neighbour.
 
 # %%
