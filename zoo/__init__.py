@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from zoo.catalogue import list_models
     from zoo.datasets.library import list_data, load_data
     from zoo.datasets.records import Pairs, Sequences
+    from zoo.ensemble import Ensemble, fit_ensemble
     from zoo.evaluation.table import Table
     from zoo.prediction import Prediction
     from zoo.run import Run, create, evaluate, fit, load
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Ensemble",
     "Pairs",
     "Prediction",
     "Run",
@@ -30,6 +32,7 @@ __all__ = [
     "create",
     "evaluate",
     "fit",
+    "fit_ensemble",
     "list_data",
     "list_models",
     "load",
@@ -37,6 +40,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "Ensemble": "zoo.ensemble",
     "Pairs": "zoo.datasets.records",
     "Prediction": "zoo.prediction",
     "Run": "zoo.run",
@@ -46,6 +50,7 @@ _HOME = {
     "create": "zoo.run",
     "evaluate": "zoo.run",
     "fit": "zoo.run",
+    "fit_ensemble": "zoo.ensemble",
     "list_data": "zoo.datasets.library",
     "list_models": "zoo.catalogue",
     "load": "zoo.run",

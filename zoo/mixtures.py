@@ -8,14 +8,14 @@ as standard normal scores Φ⁻¹(level), so that neither tail loses digits.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Predictive", "cdf", "log_density", "normal_score", "quantile"]
+__all__ = ["Predictive", "cdf", "log_density", "normal_score", "pooled", "quantile"]
 
 _BLOCK = 2**18
 _FARTHEST = 37.0
@@ -65,6 +65,61 @@ class Predictive:
             joint=self.joint,
             draws=None if self.draws is None else self.draws * scale + shift,
         )
+
+
+def pooled(parts: Sequence[Predictive]) -> Predictive:
+    """The equal mixture 1/M Σ_m p_m of several distributions of the same quantity.
+
+    >>> two = [Predictive(location=torch.full((k, 1), float(k))) for k in (1, 3)]
+    >>> pooled(two).location.flatten()
+    tensor([1., 1., 1., 3., 3., 3.])
+    """
+    shapes = {tuple(p.location.shape[1:]) for p in parts}
+    if len(shapes) != 1:
+        raise ValueError(f"distributions to be mixed have shapes {sorted(shapes)}; one is needed")
+    count = math.lcm(*(p.location.shape[0] for p in parts))
+    location = torch.cat([_repeated(p.location, count) for p in parts])
+    return Predictive(
+        location=location,
+        noise=_pooled_spread([p.noise for p in parts], parts, count),
+        epistemic=_pooled_spread([p.epistemic for p in parts], parts, count),
+        joint=all(_is_joint(p) for p in parts),
+        draws=_pooled_draws(parts),
+    )
+
+
+def _repeated(tensor: Tensor, count: int) -> Tensor:
+    return tensor.repeat_interleave(count // tensor.shape[0], 0)
+
+
+def _pooled_spread(
+    spreads: Sequence[Tensor | None], parts: Sequence[Predictive], count: int
+) -> Tensor | None:
+    """Spreads of all components, 0 where a distribution has none and another has."""
+    if all(s is None for s in spreads):
+        return None
+    full = [
+        torch.zeros_like(p.location) if s is None else s.expand_as(p.location)
+        for s, p in zip(spreads, parts, strict=True)
+    ]
+    return torch.cat([_repeated(s, count) for s in full])
+
+
+def _is_joint(p: Predictive) -> bool:
+    """Whether components are whole trajectories; a deterministic one is."""
+    return p.joint or (len(p.location) == 1 and p.noise is None and p.epistemic is None)
+
+
+def _pooled_draws(parts: Sequence[Predictive]) -> Tensor | None:
+    """As many joint draws of every distribution, where one has to be drawn from."""
+    if all(p.draws is None for p in parts):
+        return None
+    paths = [p.location if p.draws is None and _is_joint(p) else p.draws for p in parts]
+    known = [path for path in paths if path is not None]
+    if len(known) < len(parts):
+        return None
+    count = math.lcm(*(len(path) for path in known))
+    return torch.cat([_repeated(path, count) for path in known])
 
 
 def cdf(location: Tensor, scale: Tensor | None, value: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ from zoo.assembly import Assembly, create
 from zoo.datasets.records import Pairs, Sequences
 from zoo.datasets.scaling import Scaler
 from zoo.errors import NotCapableError
-from zoo.evaluation.calibration import recalibrate
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
 from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
@@ -25,13 +24,12 @@ from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.inference.train import Session, train_model
 from zoo.prediction import Prediction, Predictive, Recalibration
-from zoo.tasks import Setup, trials
+from zoo.tasks import Method, Setup, Trained, corrections, trials
 from zoo.types import Batch, Posterior
 
 __all__ = ["Run", "create", "evaluate", "fit", "load"]
 
 Resume = Literal["never", "auto", "must"]
-Method = Literal["conformal", "isotonic", "scale"]
 
 
 @dataclass(kw_only=True)
@@ -182,11 +180,7 @@ class Run:
     ) -> Run:
         """Fit and keep a correction of every spread on movements that training never saw."""
         check_unseen(data, self.trained_on["fingerprints"], "calibration")
-        for trial in trials(self, data, tasks, setup):
-            if trial.prediction.has_spread:
-                self.recalibrations[trial.task] = recalibrate(
-                    method, trial.prediction.raw, trial.truth, trial.mask, trial.groups
-                )
+        self.recalibrations.update(corrections(self, data, method, tasks, setup))
         return self
 
     def report(self) -> dict[str, Any]:
@@ -290,7 +284,7 @@ def fit(
 
 
 def evaluate(
-    run: Run,
+    run: Trained,
     data: Pairs | Sequences,
     *,
     tasks: Sequence[str] | None = None,

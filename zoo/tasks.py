@@ -4,26 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from zoo.datasets.records import Groups, Pairs, Sequences
 from zoo.errors import UnknownNameError
-from zoo.prediction import Prediction
+from zoo.evaluation.calibration import recalibrate
+from zoo.prediction import Prediction, Recalibration
 
 __all__ = [
     "TASKS",
+    "Method",
     "Predictor",
     "Setup",
+    "Trained",
     "Trial",
     "beginning",
+    "corrections",
     "hide_joints",
     "hide_section",
     "trials",
 ]
 
+Method = Literal["conformal", "isotonic", "scale"]
 _Record = TypeVar("_Record", Pairs, Sequences)
 
 
@@ -49,6 +54,20 @@ class Predictor(Protocol):
 
     def impute(self, data: Sequences, *, draws: int, seed: int) -> Prediction:
         """The missing entries."""
+        ...
+
+
+class Trained(Predictor, Protocol):
+    """A predictor that knows what it was trained on: a run or an ensemble of runs."""
+
+    @property
+    def name(self) -> str:
+        """Name of the entry or entries."""
+        ...
+
+    @property
+    def trained_on(self) -> dict[str, Any]:
+        """``name`` and ``fingerprints`` of the training data."""
         ...
 
 
@@ -159,6 +178,21 @@ def trials(
             )
         names = list(tasks)
     return [TASKS[name][1](run, data, setup or Setup()) for name in names]
+
+
+def corrections(
+    run: Predictor,
+    data: Pairs | Sequences,
+    method: Method,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> dict[str, Recalibration]:
+    """A correction of the spread for every task, fitted on ``data``."""
+    return {
+        trial.task: recalibrate(method, trial.prediction.raw, trial.truth, trial.mask, trial.groups)
+        for trial in trials(run, data, tasks, setup)
+        if trial.prediction.has_spread
+    }
 
 
 def beginning(data: Sequences, seen: int, horizon: int) -> Sequences:

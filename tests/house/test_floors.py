@@ -29,6 +29,7 @@ FLOORS = {
     "zoo.tasks": 4,
     "zoo.exchange": 4,
     "zoo.run": 4,
+    "zoo.ensemble": 4,
     "zoo.storage": 4,
     "zoo.cards": 5,
     "zoo.experiments": 5,

@@ -1,0 +1,228 @@
+"""Several trained models as one: an equal mixture of their predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
+from torch import Tensor
+
+from zoo import archive
+from zoo.assembly import Assembly
+from zoo.datasets.records import Pairs, Sequences
+from zoo.errors import DamagedRunError, NotCapableError
+from zoo.evaluation.calibration import recalibration_from_state
+from zoo.exchange import check_unseen, question
+from zoo.mixtures import pooled
+from zoo.prediction import Prediction, Recalibration
+from zoo.run import Resume, Run, fit
+from zoo.storage import load_run
+from zoo.tasks import Method, Setup, corrections
+
+__all__ = ["Ensemble", "fit_ensemble"]
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Index:
+    members: int
+    recalibrations: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ensemble:
+    r"""Runs of one layout whose predictions are averaged as distributions.
+
+    p(y | x) = 1/M Σ_m p_m(y | x)
+
+    Lakshminarayanan, Pritzel & Blundell, *Simple and scalable predictive uncertainty estimation
+    using deep ensembles*, NIPS 2017. Members that are deterministic, such as ae-dmp, get a spread
+    here: that of the members, and with few of them a coarse one, so that it wants calibration. The
+    members may be of different entries. Latent coordinates of different members mean different
+    things: an ensemble does not represent. The members' own recalibrations are not used; the
+    ensemble keeps its own.
+
+    >>> import numpy as np, zoo
+    >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
+    >>> runs = [zoo.fit(zoo.create(name, data), data) for name in ("mean", "last-value")]
+    >>> zoo.Ensemble(members=tuple(runs)).forecast(data.frames(0, 12), horizon=8).shape
+    (4, 8, 3)
+    """
+
+    members: tuple[Run, ...]
+    recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse an empty ensemble, and members of different channels, units or rates."""
+        if not self.members:
+            raise ValueError("an ensemble needs at least 1 member; got none")
+        first = self.members[0].assembly.layout
+        for run in self.members[1:]:
+            first.check(run.assembly.layout)
+
+    @property
+    def name(self) -> str:
+        """The members' entries, each once."""
+        return "ensemble of " + " + ".join(dict.fromkeys(run.name for run in self.members))
+
+    @property
+    def capabilities(self) -> tuple[str, ...]:
+        """What every member can do, but for latent trajectories."""
+        common = set.intersection(*(set(run.capabilities) for run in self.members))
+        return tuple(c for c in self.members[0].capabilities if c in common and c != "represent")
+
+    @property
+    def trained_on(self) -> dict[str, Any]:
+        """Names and fingerprints of all the data that a member was trained on."""
+        known = [run.trained_on for run in self.members]
+        return {
+            "name": ", ".join(dict.fromkeys(k["name"] for k in known)),
+            "fingerprints": sorted({f for k in known for f in k["fingerprints"]}),
+        }
+
+    def forecast(
+        self, data: Sequences, *, horizon: int, draws: int = 200, seed: int = 0
+    ) -> Prediction:
+        """The ``horizon`` frames after the movements in ``data``."""
+        return self._pooled(
+            "forecast", lambda r, s: r.forecast(data, horizon=horizon, draws=draws, seed=s), seed
+        )
+
+    def reconstruct(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """The movements as the members reproduce them."""
+        return self._pooled(
+            "reconstruct", lambda r, s: r.reconstruct(data, draws=draws, seed=s), seed
+        )
+
+    def impute(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """All entries of the movements, those missing filled in."""
+        return self._pooled(
+            question("impute", data), lambda r, s: r.impute(data, draws=draws, seed=s), seed
+        )
+
+    def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """Targets of new inputs."""
+        return self._pooled("regress", lambda r, s: r.regress(data, draws=draws, seed=s), seed)
+
+    def generate(
+        self,
+        like: Sequences,
+        *,
+        goal: ArrayLike | None = None,
+        duration: float = 1.0,
+        onto: Sequences | None = None,
+        start: int = 0,
+        steps: int = 1,
+        draws: int = 200,
+        seed: int = 0,
+    ) -> Prediction:
+        """New movements after the demonstrations ``like``, as :meth:`zoo.run.Run.generate`."""
+
+        def generated(run: Run, member_seed: int) -> Prediction:
+            return run.generate(
+                like,
+                goal=goal,
+                duration=duration,
+                onto=onto,
+                start=start,
+                steps=steps,
+                draws=draws,
+                seed=member_seed,
+            )
+
+        return self._pooled("generate", generated, seed)
+
+    def calibrate(
+        self,
+        data: Pairs | Sequences,
+        *,
+        method: Method = "conformal",
+        tasks: Sequence[str] | None = None,
+        setup: Setup | None = None,
+    ) -> Ensemble:
+        """Fit and keep a correction of every spread on movements that no member saw."""
+        check_unseen(data, self.trained_on["fingerprints"], "calibration")
+        self.recalibrations.update(corrections(self, data, method, tasks, setup))
+        return self
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the members and the ensemble's calibration as folders of safetensors and JSON."""
+        folder, tensors, states = Path(folder), dict[str, Tensor](), dict[str, Any]()
+        for i, run in enumerate(self.members):
+            run.save(folder / f"member-{i}")
+        for task, recalibration in self.recalibrations.items():
+            states[task], extra = recalibration.state()
+            tensors.update({f"{task}.{k}": v for k, v in extra.items()})
+        meta = {"members": len(self.members), "recalibrations": states}
+        archive.write(folder, "ensemble", meta, tensors, version=FORMAT_VERSION)
+        return folder
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Self:
+        """An ensemble that :meth:`save` wrote; a damaged or foreign folder is refused."""
+        folder = Path(folder)
+        meta, tensors = archive.read(folder, "ensemble", version=FORMAT_VERSION)
+        try:
+            index = TypeAdapter(_Index).validate_python(meta)
+            found = {
+                task: recalibration_from_state(state, _part(tensors, f"{task}."))
+                for task, state in index.recalibrations.items()
+            }
+        except (LookupError, RuntimeError, TypeError, ValueError) as error:
+            raise DamagedRunError(
+                f"{folder}/ensemble.json does not describe an ensemble: {error}"
+            ) from error
+        members = tuple(load_run(folder / f"member-{i}") for i in range(index.members))
+        return cls(members=members, recalibrations=found)
+
+    def _pooled(
+        self, task: str, predict: Callable[[Run, int], Prediction], seed: int
+    ) -> Prediction:
+        need = task.split()[0]
+        if need not in self.capabilities:
+            raise NotCapableError(
+                f"{self.name} cannot {need}; all its members can {', '.join(self.capabilities)}"
+            )
+        found = [predict(run, seed + i).raw for i, run in enumerate(self.members)]
+        return replace(
+            found[0],
+            predictive=pooled([p.predictive for p in found]),
+            recalibration=self.recalibrations.get(task),
+        )
+
+
+def fit_ensemble(
+    assemblies: Sequence[Assembly],
+    train: Pairs | Sequences,
+    *,
+    val: Pairs | Sequences | None = None,
+    run_dir: str | Path | None = None,
+    resume: Resume = "never",
+    progress: bool = False,
+) -> Ensemble:
+    """Train every member on ``train``, each in a folder of its own below ``run_dir``.
+
+    >>> import numpy as np, zoo
+    >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
+    >>> members = [zoo.create("vae", data, seed=s, latent_dim=1, epochs=2) for s in range(2)]
+    >>> zoo.fit_ensemble(members, data).name
+    'ensemble of vae'
+    """
+    folders = [
+        None if run_dir is None else Path(run_dir) / f"member-{i}" for i in range(len(assemblies))
+    ]
+    return Ensemble(
+        members=tuple(
+            fit(a, train, val=val, run_dir=folder, resume=resume, progress=progress)
+            for a, folder in zip(assemblies, folders, strict=True)
+        )
+    )
+
+
+def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
