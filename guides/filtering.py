@@ -28,6 +28,7 @@ class LatentDynamics(Protocol):
     frames: int
     latent_dim: int
     kernels: int
+    goal_scaling: bool
 
     @property
     def transition(self) -> Float[Tensor, "state state"]:
@@ -49,8 +50,9 @@ class LatentDynamics(Protocol):
         w: Float[Tensor, "sequence kernel latent"],
         goal: Float[Tensor, "sequence latent"],
         batch: Batch,
+        start: Float[Tensor, "sequence latent"] | None = None,
     ) -> Float[Tensor, "step window state"]:
-        """What goal and forcing term add in every step of every window."""
+        """What goal and forcing term add in every step of every window; ``start`` if it scales."""
         ...
 
 
@@ -108,6 +110,9 @@ class FilteringGuide(nn.Module):
         with pyro.plate("movements", batch.total_sequences, subsample=torch.arange(rows)):
             w = pyro.sample("w", self.weights(batch.movements))
             goal = pyro.sample("goal", _normal(self._encode(batch.movements[:, -1]), 1))
+            start = None
+            if model.goal_scaling:
+                start = pyro.sample("start", _normal(self._encode(batch.movements[:, 0]), 1))
         h = self.trunk(batch.values)
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
             z = pyro.sample("z", _normal(self.encoder(h), 2))
@@ -116,7 +121,7 @@ class FilteringGuide(nn.Module):
                 self.noise,
                 self.noise.features(batch.values.transpose(0, 1)[1:]),
                 model.initial_state(z[:, 0], velocity),
-                model.drive(w, goal, batch),
+                model.drive(w, goal, batch, start),
                 model.transition,
                 model.noise_gain(),
             )

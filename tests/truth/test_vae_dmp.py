@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyro
@@ -14,6 +15,7 @@ from pyro import poutine
 from torch import Tensor
 
 from zoo.datasets.records import Sequences
+from zoo.dynamics.dmp import Response
 from zoo.dynamics.paths import PathPrior, Readout, _stationary
 from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.filtering import FilteringGuide
@@ -40,19 +42,26 @@ def movements(count: int = 3) -> Sequences:
     return Sequences.from_arrays(values.numpy(), rate=30.0)
 
 
-def build(data: Sequences, **guide: str) -> tuple[VaeDmp, FilteringGuide]:
-    settings = Config(latent_dim=LATENT, hidden=HIDDEN, kernels=5)
+SCALED = {"goal_scaling": True, "common_forcing": 0.1, "activation": "softplus"}
+
+
+def build(
+    data: Sequences, settings: dict[str, Any] | None = None, **guide: str
+) -> tuple[VaeDmp, FilteringGuide]:
+    settings = Config(latent_dim=LATENT, hidden=HIDDEN, kernels=5, **(settings or {}))
     model = VaeDmp(data.layout, settings)
     own = GuideConfig(hidden=HIDDEN, features=3, **guide)
     torch.nn.init.normal_(model.g[-1].weight, std=0.3)
     return model, FilteringGuide(data.layout, model, own)
 
 
-@pytest.fixture
-def pair() -> Pair:
+@pytest.fixture(params=[{}, SCALED], ids=["plain", "goal-scaling"])
+def pair(request: pytest.FixtureRequest) -> Pair:
     torch.manual_seed(0)
     data = movements()
-    model, guide = build(data)
+    model, guide = build(data, request.param)
+    if model.goal_scaling:
+        torch.nn.init.normal_(model.w_common)
     rows = torch.tensor([0, 3, 4, 8, 9, 20])
     return model, guide, Loader(data, batch_size=6, window=6, seed=0).take(rows)
 
@@ -63,9 +72,11 @@ class PerStep:
     def __init__(self, model: VaeDmp, guide: FilteringGuide, drawn: dict[str, Tensor]) -> None:
         self.model, self.guide, self.drawn = model, guide, drawn
 
-    def states(self, batch: Batch, w: Tensor, goal: Tensor, z_1: Tensor, v: Tensor, recognise):
+    def states(self, batch, w, goal, start, z_1, v, recognise):
         """Roll (74) and call ``recognise(t, z_t)`` for the noise of every step."""
         model, system = self.model, self.model.system
+        if start is not None:
+            w = w * (model.embed(goal) - model.embed(start))[:, None, :]
         z, ż = model.embed(z_1), model.config.velocity_scale * v
         path = [z]
         for t in range(batch.values.shape[1] - 1):
@@ -87,6 +98,10 @@ class PerStep:
             goal = pyro.sample(
                 "goal", dist.Normal(*guide.encoder(guide.trunk(batch.movements[:, -1])))
             )
+            start = None
+            if self.model.goal_scaling:
+                moments = guide.encoder(guide.trunk(batch.movements[:, 0]))
+                start = pyro.sample("start", dist.Normal(*moments))
         with poutine.scale(scale=batch.total / len(batch)):
             z = pyro.sample("z", dist.Normal(*guide.encoder(h)))
             v = pyro.sample("velocity", dist.Normal(*guide.velocity(h[:, :2].flatten(1))))
@@ -95,7 +110,7 @@ class PerStep:
                 moments = guide.noise(guide.noise.features(batch.values[:, t + 1]), state)
                 return pyro.sample(f"epsilon_{t}", dist.Normal(*moments))
 
-            self.states(batch, w, goal, z[:, 0], v, recognise)
+            self.states(batch, w, goal, start, z[:, 0], v, recognise)
 
     def generative(self, batch: Batch) -> None:
         model, latent = self.model, self.model.latent_dim
@@ -105,7 +120,11 @@ class PerStep:
             return dist.Normal(torch.zeros(shape), 1.0)
 
         with poutine.scale(scale=batch.total_sequences / rows):
-            w = pyro.sample("w", unit(rows, model.kernels, latent))
+            start, w_prior = None, unit(rows, model.kernels, latent)
+            if model.goal_scaling:
+                w_prior = dist.Normal(model.w_common.expand(w_prior.batch_shape), 0.1)
+                start = pyro.sample("start", unit(rows, latent))
+            w = pyro.sample("w", w_prior)
             goal = pyro.sample("goal", unit(rows, latent))
         with poutine.scale(scale=batch.total / windows):
             z = pyro.sample("z", unit(windows, time, latent))
@@ -114,7 +133,7 @@ class PerStep:
             def draw(t: int, state: Tensor) -> Tensor:
                 return pyro.sample(f"epsilon_{t}", unit(windows, latent))
 
-            path = self.states(batch, w, goal, z[:, 0], v, draw)
+            path = self.states(batch, w, goal, start, z[:, 0], v, draw)
             for name, states in (("x", path), ("x_single", model.embed(z))):
                 x = dist.Normal(model.decoder(states), model.output_std)
                 pyro.sample(name, x, obs=batch.values)
@@ -403,3 +422,24 @@ def test_goal_change_ends_at_the_goal_and_none_is_the_demonstration():
         moved = model._aimed(replace(found, w=0 * found.w), found.goal + 1.0)
         torch.testing.assert_close(model._pull(moved, 2.0)[:, :, -1], moved.goal)
         assert model._pull(moved, 2.0).shape[2] == 2 * (FRAMES - 1)
+
+
+def test_goal_scaling_keeps_the_shape_of_the_path():
+    """Without velocity and noise, (z* − z_0)/(z^goal − z_0) is the same for every goal."""
+    torch.manual_seed(7)
+    model, guide = build(movements(2), SCALED)
+    torch.nn.init.normal_(model.w_common)
+    with torch.no_grad():
+        drawn = GuidePosterior(guide).draw(whole(movements(2)), 1)
+        found = replace(model._latents(drawn), velocity=torch.zeros(1, 2, LATENT))
+        shapes = []
+        for goal in (found.goal, found.goal + 1.5, 3 - found.goal):
+            aimed = model._aimed(found, goal)
+            force = model.system.stiffness * model._pull(aimed, 1.0)
+            response = Response.of(model.system, FRAMES, force.dtype, force.device)
+            args = aimed.position, aimed.velocity, torch.zeros_like(aimed.position), force
+            path = response.states(*args)[0]
+            span = (goal - aimed.position).unsqueeze(2)
+            shapes.append((path - aimed.position.unsqueeze(2)) / span)
+    for other in shapes[1:]:
+        torch.testing.assert_close(other, shapes[0])

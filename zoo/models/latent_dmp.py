@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import pyro.distributions as dist
 import torch
 from jaxtyping import Float
+from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.dynamics.dmp import (
@@ -16,44 +18,66 @@ from zoo.dynamics.dmp import (
     input_vector,
     transition_matrix,
 )
-from zoo.nn.mlp import mlp
+from zoo.nn.metric import pullback_metric
+from zoo.nn.mlp import Activation, mlp
 from zoo.types import Batch, Layout
 
 __all__ = ["Config", "LatentDmp"]
 
 ALPHA, ALPHA_FRAME = 25.0, 0.4
+BEYOND = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """``latent_dim`` d', ``hidden`` decoder units, ``kernels`` of the forcing term, α (β = α/4).
+    """``latent_dim`` d', ``hidden`` decoder units of ``activation``, ``kernels``, α (β = α/4).
 
     None for α is 25 a movement, or 0.4 a frame for movements under 64 frames, whose Euler steps
     would else be unstable. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
     w and ż_1, in units of the acceleration αβ and of the movement's length; ``noise_scale`` is
-    where w_ε starts, in the same unit as w; ``output_std`` where the constant output spread
-    starts, in scaled units, never below ``output_floor``.
+    where w_ε starts, in the same unit as w, and stays where ``fixed_noise``; ``output_std`` where
+    the constant output spread starts, in scaled units, never below ``output_floor``.
+
+    ``goal_scaling`` multiplies the forcing term by z^goal − z_0, the first frame, as §6.3.2 does:
+    w then says how a movement goes to its goal, wherever that is. ``common_forcing`` is the
+    standard deviation of w about one w̄ of all movements and dimensions, which is learned: paths
+    are straight in latent space, and the decoder has to bend them; None: 1, about 0.
+
+    ``flatness`` is the weight η of a prior p(g) ∝ exp(−η ‖G(z)/c² − I‖²) on the decoder's metric
+    G = JᵀJ, J = dx/dz, c² its mean, at points on lines through pairs of frames and beyond: equal
+    steps in latent space are then equal movements (Chen et al., *Learning flat latent manifolds
+    with VAEs*, ICML 2020). It needs an ``activation`` without kinks.
     """
 
     latent_dim: int = 5
     hidden: int = 200
+    activation: Activation = "relu"
     kernels: int = 50
     alpha: float | None = None
     transition_hidden: int = 32
     w_scale: float = 3.0
     velocity_scale: float = 10.0
     noise_scale: float = 0.3
+    fixed_noise: bool = False
     output_std: float = 0.3
     output_floor: float = 1e-3
+    goal_scaling: bool = False
+    common_forcing: float | None = None
+    flatness: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse empty layers and scales."""
         for name in ("latent_dim", "hidden", "transition_hidden"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
+        if self.flatness < 0:
+            raise ValueError(f"flatness must be at least 0; got {self.flatness}")
+        if self.flatness and self.activation == "relu":
+            raise ValueError("flatness needs a smooth activation, such as softplus; got relu")
         if self.kernels < 2:
             raise ValueError(f"kernels must be at least 2; got {self.kernels}")
-        for name in ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std"):
+        scales = ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std")
+        for name in (*scales, "common_forcing"):
             if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
 
@@ -64,6 +88,7 @@ class LatentDmp(nn.Module):
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float32
 
+    w_noise: Tensor
     basis: Tensor
     step_matrix: Tensor
     step_input: Tensor
@@ -73,12 +98,19 @@ class LatentDmp(nn.Module):
         super().__init__()
         self.config, self.frames = config, _frames(layout)
         self.latent_dim, self.kernels = config.latent_dim, config.kernels
+        self.goal_scaling = config.goal_scaling
         channels, latent = len(layout.channels), config.latent_dim
         self.system = _system(config.alpha, self.frames)
-        self.decoder = mlp([latent, config.hidden, channels])
+        self.decoder = mlp([latent, config.hidden, channels], config.activation)
         self.g = mlp([latent, config.transition_hidden, latent], "tanh")
         nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
-        self.w_noise = nn.Parameter(config.noise_scale * torch.eye(latent))
+        if config.common_forcing is not None:
+            self.w_common = nn.Parameter(torch.zeros(config.kernels, 1))
+        w_noise = config.noise_scale * torch.eye(latent)
+        if config.fixed_noise:
+            self.register_buffer("w_noise", w_noise)
+        else:
+            self.w_noise = nn.Parameter(w_noise)
         self.output_root = nn.Parameter(torch.full((channels,), config.output_std**0.5))
         eye = torch.eye(latent, dtype=torch.float64)
         matrix = transition_matrix(self.system).T.contiguous()
@@ -102,6 +134,33 @@ class LatentDmp(nn.Module):
         moved: Tensor = z + self.g(z)
         return moved
 
+    def forcing_prior(self, rows: int) -> TorchDistribution:
+        """p(w) of ``rows`` movements."""
+        shape = [rows, self.kernels, self.latent_dim]
+        zero, spread = self.basis.new_zeros(()), self.config.common_forcing
+        mean = zero if spread is None else self.w_common
+        prior = dist.Normal(mean, zero + (1.0 if spread is None else spread), validate_args=False)
+        normal: TorchDistribution = prior.expand(shape).to_event(2)
+        return normal
+
+    def scaled(
+        self,
+        w: Float[Tensor, "*sequence kernel latent"],
+        goal: Float[Tensor, "*sequence latent"],
+        start: Float[Tensor, "*sequence latent"] | None,
+    ) -> Float[Tensor, "*sequence kernel latent"]:
+        """w (z^goal − z_0), in the space of z*, where there is a ``start``: goal scaling."""
+        return w if start is None else w * (goal - start).unsqueeze(-2)
+
+    def flatness_prior(self, path: Float[Tensor, "window time latent"]) -> Float[Tensor, " window"]:
+        """log p(g) up to a constant, −η ‖G(z)/c² − I‖² at a point for each window."""
+        near, far = path[:, 0], path[:, -1].roll(1, 0)
+        share = torch.linspace(-BEYOND, 1 + BEYOND, len(path)).to(path)[:, None]
+        metric = pullback_metric(self.decoder, torch.lerp(near, far, share))
+        eye = torch.eye(self.latent_dim).to(path)
+        size = metric.diagonal(dim1=-2, dim2=-1).mean()
+        return -self.config.flatness * (metric / size - eye).square().sum((-1, -2))
+
     def noise_gain(self) -> Float[Tensor, "latent state"]:
         """G: ε = ε̂ w_ε enters the next state as (77) says."""
         return (self.system.stiffness * self.w_noise) @ self.step_input
@@ -117,10 +176,13 @@ class LatentDmp(nn.Module):
         w: Float[Tensor, "sequence kernel latent"],
         goal: Float[Tensor, "sequence latent"],
         batch: Batch,
+        start: Float[Tensor, "sequence latent"] | None = None,
     ) -> Float[Tensor, "step window latent"]:
         """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
         steps = batch.values.shape[1] - 1
-        pull = self.embed(goal) + torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+        goal = self.embed(goal)
+        w = self.scaled(w, goal, None if start is None else self.embed(start))
+        pull = goal + torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
         at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
         row = at * pull.shape[1] + batch.sequence
         picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
@@ -131,9 +193,10 @@ class LatentDmp(nn.Module):
         w: Float[Tensor, "sequence kernel latent"],
         goal: Float[Tensor, "sequence latent"],
         batch: Batch,
+        start: Float[Tensor, "sequence latent"] | None = None,
     ) -> Float[Tensor, "step window state"]:
         """What goal and forcing term add to the state in every step, (77)."""
-        return self.forces(w, goal, batch) @ self.step_input
+        return self.forces(w, goal, batch, start) @ self.step_input
 
     def path(
         self,
@@ -143,14 +206,15 @@ class LatentDmp(nn.Module):
         goal: Float[Tensor, "sequence latent"],
         ε: Float[Tensor, "window step latent"],
         batch: Batch,
+        start: Float[Tensor, "sequence latent"] | None = None,
     ) -> Float[Tensor, "window time latent"]:
         """z*_{1:T} by the linear response of (75): no loop over time."""
         steps = batch.values.shape[1]
         response = Response.of(self.system, steps, z.dtype, z.device)
         noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
-        force = self.forces(w, goal, batch) + noise
-        start = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
-        states = response.product(start.flatten(1), force.flatten(1))
+        force = self.forces(w, goal, batch, start) + noise
+        begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
+        states = response.product(begin.flatten(1), force.flatten(1))
         return states[0].view(steps, len(batch), -1).transpose(0, 1)
 
     def kernels_at(self, steps: int, duration: float = 1.0) -> Float[Tensor, "step kernel"]:

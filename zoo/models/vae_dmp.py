@@ -10,10 +10,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from zoo.dynamics.components import ramp
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.paths import Conditioned, PathPrior, Readout
 from zoo.errors import NotFittedError
 from zoo.inference.chain import conditional_draws
+from zoo.inference.laplace import laplace
 from zoo.models.latent_dmp import Config, LatentDmp
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -66,13 +68,18 @@ class VaeDmp(LatentDmp):
         unit = dist.Normal(self.basis.new_zeros(()), self.basis.new_ones(()), validate_args=False)
         rows = len(batch.movements)
         with pyro.plate("movements", batch.total_sequences, subsample=torch.arange(rows)):
-            w = pyro.sample("w", unit.expand([rows, self.kernels, latent]).to_event(2))
+            w = pyro.sample("w", self.forcing_prior(rows))
             goal = pyro.sample("goal", unit.expand([rows, latent]).to_event(1))
+            start = None
+            if self.goal_scaling:
+                start = pyro.sample("start", unit.expand([rows, latent]).to_event(1))
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
             z = pyro.sample("z", unit.expand([windows, time, latent]).to_event(2))
             velocity = pyro.sample("velocity", unit.expand([windows, latent]).to_event(1))
             ε = pyro.sample("epsilon", unit.expand([windows, time - 1, latent]).to_event(2))
-            path = self.path(z[:, 0], velocity, w, goal, ε, batch)
+            path = self.path(z[:, 0], velocity, w, goal, ε, batch, start)
+            if self.config.flatness:
+                pyro.factor("flatness", self.flatness_prior(path))
             mean = self.decoder(torch.stack([path, self.embed(z)]))
             for name, frames in zip(("x", "x_single"), mean, strict=True):
                 x = dist.Normal(frames, self.output_std, validate_args=False)
@@ -117,11 +124,12 @@ class VaeDmp(LatentDmp):
         guide = _need(posterior)
         here = self._latents(guide.draw(batch, draws))
         if goal is not None:
-            here = self._aimed(here, self.embed(guide.encode(goal).sample((draws,))))
+            here = self._aimed(here, self._goal(goal, guide, draws))
         pull, position, velocity = self._pull(here, duration), here.position, here.velocity
         if onto is not None:
             there = self._pull(self._latents(guide.draw(onto, draws)), duration)
-            pull = torch.lerp(pull, there, _ramp(pull.shape[-2], start, steps))
+            η = ramp(pull.shape[-2] + 1, start, steps)[:, None]
+            pull = torch.lerp(pull, there, η.to(pull))
         noise = torch.randn_like(pull) @ self.w_noise
         system = replace(self.system, tau=duration)
         response = Response.of(system, pull.shape[-2] + 1, pull.dtype, pull.device)
@@ -157,9 +165,12 @@ class VaeDmp(LatentDmp):
         return Readout(jacobian.detach().double().view(shape), self.output_std.detach().double())
 
     def _latents(self, drawn: dict[str, Tensor]) -> _Latents:
+        start = self.embed(drawn["start"]) if self.goal_scaling else None
+        goal = self.embed(drawn["goal"])
         return _Latents(
-            w=drawn["w"],
-            goal=self.embed(drawn["goal"]),
+            w=self.scaled(drawn["w"], goal, start),
+            unscaled=drawn["w"] if self.goal_scaling else None,
+            goal=goal,
             position=self.embed(drawn["z"][:, :, 0]),
             velocity=self.config.velocity_scale * drawn["velocity"],
         )
@@ -170,18 +181,25 @@ class VaeDmp(LatentDmp):
         basis = self.config.w_scale * self.kernels_at(steps, duration).to(found.w)
         return found.goal.unsqueeze(2) + basis @ found.w
 
+    def _goal(self, x: Tensor, guide: Posterior, draws: int) -> Tensor:
+        """z* of frames to end at, by the decoder: an encoder knows only frames like its own."""
+        start = guide.encode(x).mean
+        known = laplace(lambda z: self.decoder(self.embed(z)), start, x, self.output_std)
+        return self.embed(known.sample((draws,)))
+
     def _aimed(self, found: _Latents, goal: Float[Tensor, "sample sequence d"]) -> _Latents:
         """Another goal, the forcing term multiplied by (g − y_0)/(g_fit − y_0), §6.2.5."""
+        if found.unscaled is not None:
+            return replace(found, w=self.scaled(found.unscaled, goal, found.position), goal=goal)
         old, new = found.goal - found.position, goal - found.position
         ratio = (new * old + GOAL_SLACK) / (old.square() + GOAL_SLACK)
         return replace(found, w=found.w * ratio.unsqueeze(2), goal=goal)
 
     def _paths(self, drawn: dict[str, Tensor], batch: Batch, draws: int) -> Tensor:
         flat = {name: value.flatten(0, 1) for name, value in drawn.items()}
-        first = flat["z"][:, 0]
-        path = self.path(
-            first, flat["velocity"], flat["w"], flat["goal"], flat["epsilon"], batch.repeat(draws)
-        )
+        first, velocity, ε = flat["z"][:, 0], flat["velocity"], flat["epsilon"]
+        every, start = batch.repeat(draws), flat.get("start")
+        path = self.path(first, velocity, flat["w"], flat["goal"], ε, every, start)
         split: Tensor = path.unflatten(0, (draws, len(batch)))
         return split
 
@@ -262,9 +280,10 @@ class VaeDmp(LatentDmp):
 
 @dataclass(frozen=True)
 class _Latents:
-    """What belongs to movements: w and, in the space of z*, goal, first frame and velocity."""
+    """What belongs to movements; ``unscaled`` is w before it is multiplied by goal − start."""
 
     w: Float[Tensor, "sample sequence kernel latent"]
+    unscaled: Float[Tensor, "sample sequence kernel latent"] | None
     goal: Float[Tensor, "sample sequence latent"]
     position: Float[Tensor, "sample sequence latent"]
     velocity: Float[Tensor, "sample sequence latent"]
@@ -290,12 +309,6 @@ def _frames_seen(batch: Batch) -> Tensor:
     if batch.mask is None:
         return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=batch.values.device)
     return batch.mask.all(-1)
-
-
-def _ramp(length: int, start: int, steps: int) -> Float[Tensor, "step 1"]:
-    """η of the movement switched to: 0 before ``start``, 1 from ``start + steps`` on, (89)."""
-    time = torch.arange(length, dtype=torch.float32)[:, None]
-    return ((time - start) / max(steps, 1)).clamp(0, 1)
 
 
 def _need(posterior: Posterior | None) -> Posterior:

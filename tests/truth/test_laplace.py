@@ -1,0 +1,41 @@
+"""Laplace's approximation: exact where the decoder is linear, the mode where it is not."""
+
+from __future__ import annotations
+
+import torch
+from scipy.optimize import minimize
+
+from zoo.inference.laplace import laplace
+from zoo.nn.mlp import mlp
+
+
+def test_a_linear_decoder_gives_the_exact_posterior() -> None:
+    """Mean and covariance of Bayesian linear regression, in float64."""
+    torch.manual_seed(0)
+    W, x = torch.randn(6, 2, dtype=torch.float64), torch.randn(4, 6, dtype=torch.float64)
+    σ = torch.rand(6, dtype=torch.float64) + 0.1
+    found = laplace(lambda z: z @ W.T, torch.randn(4, 2, dtype=torch.float64), x, σ)
+    precision = torch.eye(2, dtype=torch.float64) + W.T @ torch.diag(σ**-2) @ W
+    mean = torch.linalg.solve(precision, (x / σ**2 @ W).T).T
+    torch.testing.assert_close(found.mean, mean, rtol=1e-8, atol=1e-8)
+    expected = torch.linalg.inv(precision).expand(4, 2, 2)
+    torch.testing.assert_close(found.covariance_matrix, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_a_network_s_mode_is_that_of_a_general_optimiser() -> None:
+    """BFGS of scipy from the same start finds no lower minus log joint."""
+    torch.manual_seed(1)
+    network = mlp([2, 16, 5], "tanh").double()
+    start, x = torch.zeros(3, 2, dtype=torch.float64), torch.randn(3, 5, dtype=torch.float64)
+    σ = torch.full((5,), 0.3, dtype=torch.float64)
+
+    def loss(z: torch.Tensor, row: int) -> float:
+        with torch.no_grad():
+            apart = (x[row] - network(z)) / σ
+        return float((apart.square().sum() + z.square().sum()) / 2)
+
+    with torch.no_grad():
+        found = laplace(network, start, x, σ)
+    for row in range(3):
+        other = minimize(lambda z, row=row: loss(torch.from_numpy(z), row), start[row].numpy())
+        assert loss(found.mean[row], row) <= other.fun + 1e-6 * abs(other.fun)
