@@ -208,6 +208,43 @@ def experiment(
     print_json(result.to_json()) if json else Console().print(result)
 
 
+@app.command()
+def leaderboard(
+    name: Annotated[
+        str | None, typer.Argument(help="A protocol; none lists all.", metavar="PROTOCOL")
+    ] = None,
+    models: Annotated[
+        str, typer.Option(help="Entries, separated by commas; default: the protocol's.")
+    ] = "",
+    seeds: Annotated[int, typer.Option(help="Trainings of each entry, seeds 0, 1, …")] = 1,
+    folds: Annotated[
+        int | None, typer.Option(help="Folds of whole groups; default: one for each group.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes, of one thread each.")] = 1,
+    output: Annotated[Path, typer.Option(help="Folder for table and figure.")] = Path("results"),
+    json: Json = False,
+) -> None:
+    """Compare models on movements held out, with intervals over groups and paired tests."""
+    from zoo.console import data_table, print_json
+    from zoo.leaderboard import PROTOCOLS, run_leaderboard
+
+    if name is None:
+        listing = {k: p.summary for k, p in PROTOCOLS.items()}
+        print_json(listing) if json else Console().print(data_table(listing))
+        return
+    with _interruptible("repeat the command: what was found is kept under runs/leaderboard"):
+        result = run_leaderboard(
+            name,
+            output,
+            models=[m for m in models.split(",") if m],
+            seeds=seeds,
+            folds=folds,
+            jobs=jobs,
+            note=lambda line: print(line, file=sys.stderr),
+        )
+    print_json(result.to_json()) if json else Console().print(result)
+
+
 @contextmanager
 def _interruptible(advice: str) -> Iterator[None]:
     try:

@@ -33,6 +33,7 @@ FLOORS = {
     "zoo.storage": 4,
     "zoo.cards": 5,
     "zoo.experiments": 5,
+    "zoo.leaderboard": 5,
     "zoo.workflow": 5,
     "zoo.console": 6,
     "zoo.cli": 6,

@@ -41,6 +41,30 @@ class PathPrior:
     shrinkage: float = 0.1
     process: float = 1.0
 
+    @classmethod
+    def of_responses(
+        cls,
+        response: Float[Tensor, "time parameter"],
+        parameters: Float[Tensor, "movement parameter latent"],
+        variance: Float[Tensor, "parameter latent"],
+        residuals: Float[Tensor, "movement time latent"],
+        observation: Float[Tensor, "latent latent"],
+        shape: Sequence[float] = (),
+    ) -> Self:
+        """The mixture around linear responses; ``shape`` is h, λ and ν where these are known."""
+        return cls(
+            response @ parameters + residuals,
+            torch.einsum("tk,kd,sk->dts", response, variance, response),
+            residuals,
+            observation,
+            *shape,
+        )
+
+    @property
+    def shape(self) -> tuple[float, float, float]:
+        """h, λ and ν."""
+        return self.bandwidth, self.shrinkage, self.process
+
     @property
     def means(self) -> Float[Tensor, "movement time latent"]:
         """Means of the components."""

@@ -22,7 +22,7 @@ from zoo.errors import UnknownNameError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "Experiment", "Result", "run_experiment"]
+__all__ = ["EXPERIMENTS", "Experiment", "Result", "run_experiment", "write_result"]
 
 Source = Literal["thesis", "public", "simulated"]
 
@@ -52,6 +52,7 @@ class Result:
     cards: Sequence[Mapping[str, Any]] = ()
     figure: Figure | None = None
     identifier: str = ""
+    command: str = ""
     seconds: float = 0.0
 
     def markdown(self) -> str:
@@ -68,7 +69,7 @@ class Result:
             "id": self.identifier,
             "title": self.title,
             "source": self.source,
-            "command": f"zoo experiment {self.identifier}",
+            "command": self.command or f"zoo experiment {self.identifier}",
             "seed": self.seed,
             "seconds": round(self.seconds, 1),
             "columns": list(self.columns),
@@ -76,7 +77,7 @@ class Result:
             "findings": list(self.findings),
             "details": dict(self.details),
             "cards": [
-                {**c, "source": self.source, "command": f"zoo experiment {self.identifier}"}
+                {"source": self.source, "command": f"zoo experiment {self.identifier}", **c}
                 for c in self.cards
             ],
             "versions": {n: version(n) for n in ("movezoo", "torch", "pyro-ppl", "numpy")},
@@ -93,9 +94,21 @@ EXPERIMENTS: dict[str, Experiment] = {
         summary="five movements by AE-DMP, its parts apart, DMP and PCA-DMP, against Table 2",
         module="zoo.experiments.e5_1",
     ),
+    "E5.4": Experiment(
+        summary="missing joints of walking by the denoising chain and by conditioning, Table 3",
+        module="zoo.experiments.e5_4",
+    ),
+    "E5.5": Experiment(
+        summary="a missing section of walking: 10 frames seen, 60 filled in, Fig. 40",
+        module="zoo.experiments.e5_5",
+    ),
     "E6.1": Experiment(
         summary="five movements in one VAE-DMP and each in its own, against Table 2 and Fig. 45",
         module="zoo.experiments.e6_1",
+    ),
+    "E6.5": Experiment(
+        summary="a robot arm sent to goals it was never shown, against DMP, Fig. 53",
+        module="zoo.experiments.e6_5",
     ),
 }
 
@@ -110,7 +123,12 @@ def run_experiment(
     run: Callable[..., Result] = import_module(EXPERIMENTS[identifier].module).run
     began = time.monotonic()
     found = run(quick=quick, progress=progress)
-    result = replace(found, identifier=identifier, seconds=time.monotonic() - began)
+    return write_result(found, identifier, output, time.monotonic() - began)
+
+
+def write_result(found: Result, identifier: str, output: Path, seconds: float) -> Result:
+    """The result under its name, written as ``ID.md``, ``ID.json`` and ``ID.png``."""
+    result = replace(found, identifier=identifier, seconds=seconds)
     _write(result, output)
     return result
 

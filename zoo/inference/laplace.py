@@ -9,6 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from zoo.nn.metric import jacobians
+
 __all__ = ["laplace"]
 
 ITERATIONS, DAMPING = 50, 1e-2
@@ -19,33 +21,49 @@ def laplace(
     start: Float[Tensor, "frame latent"],
     x: Float[Tensor, "frame channel"],
     std: Float[Tensor, " channel"],
+    *,
+    restarts: int = 16,
 ) -> MultivariateNormal:
     r"""p(z | x) of z ~ N(0, I), x ~ N(decode(z), diag std²), as a Gaussian at its mode.
 
-    The mode is sought from ``start`` by Levenberg and Marquardt's method; the covariance is
-    (I + JᵀJ/σ²)⁻¹ with the Jacobian J of ``decode`` there (Gauss–Newton). An amortised encoder
-    knows only frames like those of the training; this asks the decoder itself.
+    The mode is sought from ``start``, and from ``restarts`` draws of the prior, by Levenberg and
+    Marquardt's method; the covariance is (I + JᵀJ/σ²)⁻¹ with the Jacobian J of ``decode`` there
+    (Gauss–Newton). An amortised encoder knows only frames like those of the training; this asks
+    the decoder itself.
 
     >>> known = laplace(lambda z: 2 * z, torch.zeros(1, 1), torch.ones(1, 1), torch.ones(1))
     >>> round(float(known.mean), 3), round(float(known.covariance_matrix), 3)
     (0.4, 0.2)
     """
-    dtype = start.dtype
-    jacobian = torch.func.vmap(torch.func.jacfwd(lambda z: decode(z) / std))
-    z, damping = start, start.new_full((len(start), 1, 1), DAMPING)
-    eye = torch.eye(start.shape[-1], dtype=dtype, device=start.device)
-    loss = _loss(decode, z, x, std)
+    begin = torch.cat([start[None], torch.randn(restarts, *start.shape).to(start)])
+    z = _modes(decode, begin.flatten(0, 1), x.repeat(1 + restarts, 1), std)
+    losses = _loss(decode, z, x.repeat(1 + restarts, 1), std).view(1 + restarts, -1)
+    best = losses.argmin(0)[None, :, None].expand(1, *start.shape)
+    mode = z.view(begin.shape).gather(0, best)[0]
+    J = jacobians(decode, mode) / std[:, None]
+    eye = torch.eye(start.shape[-1], dtype=start.dtype, device=start.device)
+    return MultivariateNormal(mode.detach(), precision_matrix=(J.mT @ J + eye).detach())
+
+
+def _modes(
+    decode: Callable[[Tensor], Tensor],
+    z: Float[Tensor, "frame latent"],
+    x: Float[Tensor, "frame channel"],
+    std: Float[Tensor, " channel"],
+) -> Float[Tensor, "frame latent"]:
+    damping = z.new_full((len(z), 1, 1), DAMPING)
+    eye, loss = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device), _loss(decode, z, x, std)
     for _ in range(ITERATIONS):
-        J = jacobian(z)
+        J = jacobians(decode, z) / std[:, None]
         slope = z - (J.mT @ ((x - decode(z)) / std)[..., None])[..., 0]
         curvature = J.mT @ J + eye
-        step = torch.linalg.solve(curvature + damping * curvature.abs().amax() * eye, slope)
+        size = curvature.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+        step = torch.linalg.solve(curvature + damping * size * eye, slope)
         tried = _loss(decode, z - step, x, std)
         better = tried < loss
         z, loss = torch.where(better[:, None], z - step, z), torch.where(better, tried, loss)
         damping = torch.where(better[:, None, None], damping / 5, damping * 5).clamp(1e-9, 1e6)
-    J = jacobian(z)
-    return MultivariateNormal(z.detach(), precision_matrix=(J.mT @ J + eye).detach())
+    return z
 
 
 def _loss(decode: Callable[[Tensor], Tensor], z: Tensor, x: Tensor, std: Tensor) -> Tensor:

@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from zoo.dynamics.components import ramp
+from zoo.dynamics.components import alike, ramp
 from zoo.dynamics.imitator import Imitator
-from zoo.dynamics.population import Population, estimate
+from zoo.dynamics.paths import PathPrior, Readout
 from zoo.errors import NotFittedError
+from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp, widths
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -23,7 +24,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["AeDmp", "Config"]
 
 PRIORS = {"normal": dist.Normal, "laplace": dist.Laplace}
-SHRINKAGE, FLOOR = 0.3, 1e-3
+FLOOR = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,19 +83,18 @@ class AeDmp(nn.Module):
     Humanoids 2015. Defaults: layers 50–36–20–5 and back, tanh (the thesis leaves it open),
     20 kernels, λ = 1e-3, data in [−1, 1]. Latent path and networks are points: bands of
     reconstructions and new movements hold the one σ of all channels alone, which is learned.
-    Forecasts and missing sections condition a Gaussian over the θ of the training movements on the
-    frames seen, with draws; after training on a single movement it is as wide as that movement's
-    own θ. Missing joints come from the chain of §5.3.4 without the DMP. Movements must have one
-    common length.
+    Forecasts and missing sections condition a mixture around the latent paths of the training
+    movements on the frames seen (:class:`~zoo.dynamics.paths.PathPrior`), with draws; after
+    training on a single movement it is as wide as that movement's own θ. Missing joints come from
+    the chain of §5.3.4 without the DMP. Movements must have one common length.
     """
 
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float32
 
-    prior_mean: Tensor
-    prior_factors: Tensor
-    prior_private: Tensor
-    prior_noise: Tensor
+    prior_movements: Tensor
+    prior_residuals: Tensor
+    prior_shape: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model of movements of ``layout.frames`` frames, all of one length."""
@@ -106,7 +106,7 @@ class AeDmp(nn.Module):
         self.decoder = mlp(sizes, config.activation)
         self.root = nn.Parameter(torch.tensor(config.noise_std**0.5))
         self.settled = self.integrated = config.pretraining < 1
-        for name in ("prior_mean", "prior_factors", "prior_private", "prior_noise"):
+        for name in ("prior_movements", "prior_residuals", "prior_shape"):
             self.register_buffer(name, torch.empty(0))
 
     @property
@@ -155,6 +155,8 @@ class AeDmp(nn.Module):
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Missing joints by the chain of §5.3.4; missing frames by the DMP given those seen."""
         y, seen = self._encoded(batch, posterior)
+        if bool(seen.all()):
+            return self._decoded(y[None])
         paths = self._completed(y, seen, self.frames, draws)
         return self._decoded(torch.where(seen[..., None], y, paths))
 
@@ -191,15 +193,34 @@ class AeDmp(nn.Module):
         return self._decoded(path[None])
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
-        """Keep the Gaussian over the θ of the training movements and what the roll-outs leave."""
-        θ = self._imitated(batch, posterior).mT.double()
+        """Keep the θ of the training movements and what their roll-outs leave of the paths."""
         y, seen = self._encoded(batch, posterior)
-        apart = (y - self.imitator.roll_out(θ.mT).to(y)).square() * seen[..., None]
-        size = θ.square().mean((0, 1)) if len(θ) == 1 else torch.full_like(θ[0, 0], FLOOR)
-        known = estimate(θ, θ.new_zeros(()), SHRINKAGE, size)
-        self.prior_mean, self.prior_factors = known.mean.to(y), known.factors.to(y)
-        self.prior_private = known.private.to(y)
-        self.prior_noise = apart.sum((0, 1)) / seen.sum() + FLOOR**2
+        self.prior_movements = self._imitated(batch, posterior)
+        rolled = self.imitator.roll_out(self.prior_movements)
+        self.prior_residuals = (y - rolled) * seen[..., None]
+        self.prior_shape = y.new_empty(0)
+        prior, window = self._prior(self.frames), (self.frames // 7, self.frames // 2)
+        self.prior_shape = y.new_tensor(prior.tuned(window, self._readout(y)).shape)
+
+    def _readout(self, y: Float[Tensor, "sequence time latent"]) -> Readout:
+        J = jacobians(self.decoder, y.flatten(0, 1)).detach().double()
+        std = self.σ.detach().double().expand(J.shape[1])
+        return Readout(J.unflatten(0, y.shape[:2]), std)
+
+    def _prior(self, length: int) -> PathPrior:
+        """The mixture over latent paths of ``length`` frames, in float64."""
+        if not self.prior_movements.numel():
+            raise NotFittedError("ae-dmp knows no movements yet; train it by zoo.fit first")
+        θ = self.prior_movements.double()
+        size = θ.var(0) if len(θ) > 1 else θ.square().mean((0, 1)).expand_as(θ[0])
+        return PathPrior.of_responses(
+            self.imitator.design(length).to(θ.device),
+            θ,
+            size,
+            pad(self.prior_residuals.double(), (0, 0, 0, length - self.frames)),
+            FLOOR**2 * torch.eye(self.latent_dim, dtype=torch.float64, device=θ.device),
+            self.prior_shape.tolist(),
+        )
 
     def _completed(
         self,
@@ -208,19 +229,13 @@ class AeDmp(nn.Module):
         length: int,
         draws: int,
     ) -> Float[Tensor, "sample sequence frame latent"]:
-        """Draws of the roll-outs of ``length`` frames given the latent frames seen."""
-        if not self.prior_mean.numel():
-            raise NotFittedError("ae-dmp knows no movements yet; train it by zoo.fit first")
-        design = self.imitator.design(length).to(y.device)
-        weight = pad(seen, (0, length - y.shape[1])).double()[..., None]
-        gram = design.mT @ (weight * design)
-        values = pad(y.double(), (0, 0, 0, length - y.shape[1]))
-        noise = self.prior_noise.double()[:, None]
-        linear = (design.mT @ (weight * values)).mT / noise
-        prior = (self.prior_mean, self.prior_factors, self.prior_private)
-        known = Population(*(part.double() for part in prior))
-        θ = known.condition(gram[:, None] / noise[..., None], linear).sample(draws)
-        return (design @ θ.mT).to(y)
+        """Draws of paths of ``length`` frames given the latent frames seen."""
+        prior, beyond = self._prior(length), length - y.shape[1]
+        paths = y.new_empty(draws, len(y), length, self.latent_dim)
+        values, where = pad(y.double(), (0, 0, 0, beyond)), pad(seen, (0, beyond))
+        for rows, frames in alike(where):
+            paths[:, rows] = prior.condition(values[rows], frames).sample(draws).to(y)
+        return paths
 
     def _encoded(
         self, batch: Batch, posterior: Posterior | None

@@ -151,13 +151,13 @@ class VaeDmp(LatentDmp):
         noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames)[:, seen].flatten(0, 1)
         self.prior_observation = (noise.T @ noise / len(noise)).detach()
         self.prior_residuals = torch.zeros_like(frames)
-        self.prior_shape = frames.new_tensor(_shape(PathPrior))
+        self.prior_shape = frames.new_empty(0)
         rolled = self._prior(self.frames).paths.to(frames)
         self.prior_residuals = ((frames - rolled) * seen[..., None]).detach()
         tuned = self._prior(self.frames).tuned(
             (self.frames // 7, self.frames // 2), self._readout(frames)
         )
-        self.prior_shape = frames.new_tensor(_shape(tuned))
+        self.prior_shape = frames.new_tensor(tuned.shape)
 
     def _readout(self, frames: Float[Tensor, "sequence time latent"]) -> Readout:
         jacobian = torch.func.vmap(torch.func.jacfwd(self.decoder))(frames.flatten(0, 1))
@@ -227,16 +227,13 @@ class VaeDmp(LatentDmp):
         start = torch.zeros(2, self.kernels + 3, dtype=torch.float64)
         start[0, -2] = start[1, -1] = 1.0
         φ = response.product(start, nn.functional.pad(force, (0, 2)))[0]
-        residuals = nn.functional.pad(self.prior_residuals.double(), (0, 0, 0, missing))
-        bandwidth, shrinkage, process = self.prior_shape.tolist()
-        return PathPrior(
-            paths=φ @ u + residuals,
-            spread=torch.einsum("tk,kd,sk->dts", φ, _variances(u), φ),
-            residuals=residuals,
-            observation=self.prior_observation.double(),
-            bandwidth=bandwidth,
-            shrinkage=shrinkage,
-            process=process,
+        return PathPrior.of_responses(
+            φ,
+            u,
+            _variances(u),
+            nn.functional.pad(self.prior_residuals.double(), (0, 0, 0, missing)),
+            self.prior_observation.double(),
+            self.prior_shape.tolist(),
         )
 
     def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
@@ -294,10 +291,6 @@ def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row la
     apart = u - u.mean(0) if len(u) > 1 else u
     kernels = apart[:, :-3].square().mean((0, 1)).expand(u.shape[1] - 3, -1)
     return torch.cat([kernels, apart[:, -3:].square().mean(0)])
-
-
-def _shape(prior: PathPrior | type[PathPrior]) -> list[float]:
-    return [prior.bandwidth, prior.shrinkage, prior.process]
 
 
 def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
