@@ -24,6 +24,7 @@ FLOORS = {
     "zoo.models": 2,
     "zoo.guides": 2,
     "zoo.evaluation": 2,
+    "zoo.player": 2,
     "zoo.catalogue": 3,
     "zoo.assembly": 4,
     "zoo.tasks": 4,

@@ -17,7 +17,7 @@ from zoo.datasets.records import Sequences
 from zoo.run import Run, create, fit
 from zoo.strategies import Svi
 
-__all__ = ["DATA", "FRAMES", "fitted", "jogging", "mse", "walking", "without"]
+__all__ = ["DATA", "FRAMES", "both", "fitted", "jogging", "mse", "walking", "without"]
 
 FRAMES, RATE = 70, 60.0
 HIP = "rfemur_rx"
@@ -51,6 +51,22 @@ def jogging() -> Sequences:
     longest = int(np.argmax([len(a) for a in arrays]))
     cut = [a[:FRAMES] for a in arrays] + [arrays[longest][-FRAMES:]]
     return _record(data, cut, [*trials, trials[longest]])
+
+
+def both() -> Sequences:
+    """The walking to train on and the jogging, told apart by the group ``movement``."""
+    walk, jog = walking()[0], jogging()
+    return Sequences.from_arrays(
+        [*walk.arrays, *jog.arrays],
+        rate=RATE,
+        channels=walk.channels,
+        units=walk.units,
+        groups={
+            "trial": [*walk.groups["trial"], *jog.groups["trial"]],
+            "movement": ["walking"] * len(walk) + ["jogging"] * len(jog),
+        },
+        name=f"walking and jogging cut into {FRAMES} frames",
+    )
 
 
 def _starts(hip: Column) -> list[int]:

@@ -106,6 +106,18 @@ EXPERIMENTS: dict[str, Experiment] = {
         summary="five movements in one VAE-DMP and each in its own, against Table 2 and Fig. 45",
         module="zoo.experiments.e6_1",
     ),
+    "E6.2": Experiment(
+        summary="nine movements in 3-D: whether walks lie together, VAE-DMP and VAE, Fig. 47, 48",
+        module="zoo.experiments.e6_2",
+    ),
+    "E6.3": Experiment(
+        summary="smoothness of a 2-D latent space on a 120 × 120 grid, postures, Fig. 49 and 50",
+        module="zoo.experiments.e6_3",
+    ),
+    "E6.4": Experiment(
+        summary="jogging switched to walking from frame 20 to 38, (89), Fig. 51",
+        module="zoo.experiments.e6_4",
+    ),
     "E6.5": Experiment(
         summary="a robot arm sent to goals it was never shown, against DMP, Fig. 53",
         module="zoo.experiments.e6_5",

@@ -1,0 +1,8 @@
+"""Movements as moving bodies: skeletons drawn in figures and played in a page."""
+
+from __future__ import annotations
+
+from zoo.player.bodies import Arm, Body, Human, body_for
+from zoo.player.postures import posture_map, posture_strip
+
+__all__ = ["Arm", "Body", "Human", "body_for", "posture_map", "posture_strip"]
