@@ -18,7 +18,7 @@ from zoo.strategies import Svi
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["MODELS", "THESIS", "run"]
+__all__ = ["MODELS", "THESIS", "fitted", "run"]
 
 MODELS = {
     "AE-DMP": "ae-dmp",
@@ -45,7 +45,7 @@ def run(*, quick: bool, progress: bool) -> Result:
     data = load_data("thesis-movements")
     names = [m.replace("_", " ") for m in data.groups["movement"]]
     runs = {
-        label: [_fitted(model, data[i : i + 1], m, quick, progress) for i, m in enumerate(names)]
+        label: [fitted(model, data[i : i + 1], m, quick, progress) for i, m in enumerate(names)]
         for label, model in MODELS.items()
     }
     errors = {label: _errors(found, data) for label, found in runs.items()}
@@ -59,7 +59,8 @@ def _alone(run: Run, data: Sequences) -> float:
     return float(((mean - data.values.double().numpy()) ** 2).mean() / UNIT)
 
 
-def _fitted(name: str, data: Sequences, label: str, quick: bool, progress: bool) -> Run:
+def fitted(name: str, data: Sequences, label: str, quick: bool, progress: bool) -> Run:
+    """A model of one movement, kept under runs/E5.1 where it is trained."""
     assembly = create(name, data, seed=SEED)
     if not isinstance(assembly.inference, Svi):
         return fit(assembly, data)

@@ -94,6 +94,14 @@ EXPERIMENTS: dict[str, Experiment] = {
         summary="five movements by AE-DMP, its parts apart, DMP and PCA-DMP, against Table 2",
         module="zoo.experiments.e5_1",
     ),
+    "E5.2": Experiment(
+        summary="the f_target term, smoothness of latent paths, R² of joints, Fig. 34-36",
+        module="zoo.experiments.e5_2",
+    ),
+    "E5.3": Experiment(
+        summary="sparse AE-DMP of walking and jogging: kinds of units, a slow jog, Fig. 37 and 38",
+        module="zoo.experiments.e5_3",
+    ),
     "E5.4": Experiment(
         summary="missing joints of walking by the denoising chain and by conditioning, Table 3",
         module="zoo.experiments.e5_4",
@@ -101,6 +109,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "E5.5": Experiment(
         summary="a missing section of walking: 10 frames seen, 60 filled in, Fig. 40",
         module="zoo.experiments.e5_5",
+    ),
+    "E5.6": Experiment(
+        summary="punching to other goal attractors, Fig. 41",
+        module="zoo.experiments.e5_6",
     ),
     "E6.1": Experiment(
         summary="five movements in one VAE-DMP and each in its own, against Table 2 and Fig. 45",
