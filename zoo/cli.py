@@ -214,7 +214,10 @@ def leaderboard(
         str | None, typer.Argument(help="A protocol; none lists all.", metavar="PROTOCOL")
     ] = None,
     models: Annotated[
-        str, typer.Option(help="Entries, separated by commas; default: the protocol's.")
+        str,
+        typer.Option(
+            help="Entries, separated by commas; a+b is an ensemble; default: the protocol's."
+        ),
     ] = "",
     seeds: Annotated[int, typer.Option(help="Trainings of each entry, seeds 0, 1, …")] = 1,
     folds: Annotated[

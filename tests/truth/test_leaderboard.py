@@ -117,7 +117,7 @@ def test_a_repeated_command_takes_what_was_found(tiny: Protocol, tmp_path: Path)
 def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
     """Cells of a protocol that every process knows, computed apart."""
     some = [
-        Cell(protocol="arm-goals", model="promp", settings=(), seed=0, fold=k, rows=(k,))
+        Cell(protocol="arm-goals", model="promp", settings=((),), seed=0, fold=k, rows=(k,))
         for k in range(2)
     ]
     apart = cells.compute_all(some, tmp_path / "two", 2, lambda found: None)
@@ -136,6 +136,18 @@ def test_an_entry_that_fails_is_a_line_and_not_the_end(
     found = board.run_leaderboard("tiny", tmp_path, models=["mean", "ar"], root=tmp_path / "cells")
     assert [row[0] for row in found.rows] == ["mean"]
     assert any("ar failed" in line for line in found.findings)
+
+
+def test_an_ensemble_of_entries_is_one_model(tiny: Protocol, tmp_path: Path) -> None:
+    """Its predictions are the average of the members'."""
+    names = ["mean", "last-value", "mean+last-value"]
+    found = {}
+    for name in names:
+        parts = tuple(() for _ in name.split("+"))
+        cell = Cell(protocol="tiny", model=name, settings=parts, seed=0, fold=0, rows=(0, 1))
+        found[name] = cells.compute(cell, tmp_path).prediction
+    means = [p.mean for p in found.values() if p is not None]
+    torch.testing.assert_close(means[2], (means[0] + means[1]) / 2)
 
 
 def test_unknown_protocols_and_models_are_named(tmp_path: Path) -> None:

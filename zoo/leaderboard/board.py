@@ -41,7 +41,7 @@ def run_leaderboard(
     """Train, predict, calibrate and compare; cells found before are taken from ``root``."""
     asked, began = protocol(name), time.monotonic()
     chosen = tuple(models) or asked.models
-    check_models(chosen, list_models(can=asked.need), asked.need)
+    check_models([m for c in chosen for m in c.split("+")], list_models(can=asked.need), asked.need)
     if seeds < 1 or jobs < 1:
         raise ValueError(f"seeds and jobs must be at least 1; got {seeds} and {jobs}")
     data = asked.load()
@@ -72,7 +72,7 @@ def _cells(
         Cell(
             protocol=name,
             model=model,
-            settings=tuple(sorted(asked.settings.get(model, {}).items())),
+            settings=tuple(tuple(sorted(each.items())) for each in _settings(asked, model)),
             seed=seed,
             fold=k,
             rows=tuple(rows),
@@ -81,6 +81,11 @@ def _cells(
         for seed in range(seeds)
         for k, rows in enumerate(asked.folds(data, folds))
     ]
+
+
+def _settings(asked: Protocol, model: str) -> list[Mapping[str, Any]]:
+    """What every member of an ensemble, or the one model, is given."""
+    return [asked.settings.get(member, {}) for member in model.split("+")]
 
 
 def _table(
@@ -146,7 +151,7 @@ def _result(
         ),
         seed=0,
         details={
-            "settings": {m: dict(asked.settings.get(m, {})) for m in models},
+            "settings": {m: [dict(s) for s in _settings(asked, m)] for m in models},
             "groups": [str(g) for g in dict.fromkeys(data.groups[asked.by])],
             "scores": {m: {k: v.tolist() for k, v in table[m].items()} for m in order},
         },

@@ -18,6 +18,7 @@ from torch import Tensor
 import zoo
 from zoo import archive
 from zoo.datasets.records import Sequences
+from zoo.ensemble import Ensemble
 from zoo.errors import DamagedRunError
 from zoo.leaderboard.protocols import PROTOCOLS, Protocol
 from zoo.prediction import Prediction, Predictive
@@ -33,11 +34,14 @@ _PARTS = ("location", "noise", "epistemic", "draws")
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Which model, trained with which settings and seed without which rows."""
+    """Which model, trained with which settings and seed without which rows.
+
+    ``promp+kernel-ridge`` is an ensemble of two entries; ``settings`` are those of each.
+    """
 
     protocol: str
     model: str
-    settings: tuple[tuple[str, Any], ...]
+    settings: tuple[tuple[tuple[str, Any], ...], ...]
     seed: int
     fold: int
     rows: tuple[int, ...]
@@ -112,10 +116,13 @@ def _one_thread() -> None:
 def _predicted(cell: Cell, protocol: Protocol, data: Sequences, folder: Path) -> Prediction:
     inside = set(cell.rows)
     train = data[[i for i in range(len(data)) if i not in inside]]
-    assembly = create(cell.model, train, seed=cell.seed, **dict(cell.settings))
-    trained = isinstance(assembly.inference, Svi)
-    where = folder / "run" if trained else None
-    run = fit(assembly, train, run_dir=where, resume="auto" if trained else "never")
+    members = []
+    for name, settings in zip(cell.model.split("+"), cell.settings, strict=True):
+        assembly = create(name, train, seed=cell.seed, **dict(settings))
+        trained = isinstance(assembly.inference, Svi)
+        where = folder / f"run-{name}" if trained else None
+        members.append(fit(assembly, train, run_dir=where, resume="auto" if trained else "never"))
+    run = members[0] if len(members) == 1 else Ensemble(members=tuple(members))
     return protocol.answer(run, data[list(cell.rows)], draws=DRAWS, seed=cell.seed)
 
 

@@ -88,11 +88,8 @@ def _slow_walks() -> Sequences:
     return load("35-walk", frames=None, rate=30.0).frames(0, FRAMES // 4)
 
 
-def _named(names: str) -> tuple[str, ...]:
-    return (*BASELINES, *names.split())
-
-
-_FORECASTERS = _named("dmp promp promp-rhythmic")
+_FORECASTERS = (*BASELINES, "dmp", "promp", "promp-rhythmic", "kernel-ridge+promp-rhythmic")
+_IMPUTERS = ("mean", "ar", "nearest-neighbour", "kernel-ridge")
 _WALK_SETTINGS: Settings = {
     "kernel-ridge": {"places": 200},
     "vae-dmp": {"epochs": 100},
@@ -122,11 +119,11 @@ PROTOCOLS: dict[str, Protocol] = {
         load=_slow_walks,
         source="public",
         need="impute",
-        models=_named("pca promp promp-rhythmic"),
+        models=(*_IMPUTERS, "pca", "promp", "promp-rhythmic", "nearest-neighbour+promp-rhythmic"),
         hidden=LEG,
         settings={
             "pca": {"latent_dim": 12},
-            "promp-rhythmic": {"synergies": None, "kernels": 20},
+            "promp-rhythmic": {"synergies": None},
         },
     ),
     "arm-goals": Protocol(
@@ -134,7 +131,7 @@ PROTOCOLS: dict[str, Protocol] = {
         load=load_arm,
         source="simulated",
         need="forecast",
-        models=_named("dmp promp"),
+        models=(*BASELINES, "dmp", "promp"),
         seen=10,
         by="goal",
     ),
