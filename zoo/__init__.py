@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from zoo.datasets.records import Pairs, Sequences
     from zoo.ensemble import Ensemble, fit_ensemble
     from zoo.evaluation.table import Table
+    from zoo.player import play
     from zoo.prediction import Prediction
     from zoo.run import Run, create, evaluate, fit, load
 
@@ -37,6 +38,7 @@ __all__ = [
     "list_models",
     "load",
     "load_data",
+    "play",
 ]
 
 _HOME = {
@@ -55,6 +57,7 @@ _HOME = {
     "list_models": "zoo.catalogue",
     "load": "zoo.run",
     "load_data": "zoo.datasets.library",
+    "play": "zoo.player",
 }
 
 

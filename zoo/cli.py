@@ -186,6 +186,36 @@ def forecast(
         Console().print(report)
 
 
+@app.command("play")
+def play_command(
+    source: Annotated[str, typer.Argument(help="A data set by name, or a run's folder.")],
+    output: Annotated[Path, typer.Option(help="The page to write.")] = Path("movement.html"),
+    data: Unseen = None,
+    movement: Annotated[int, typer.Option(help="Which movement, from 0.")] = 0,
+    seen: Annotated[int | None, typer.Option(help="Frames shown to the forecast.")] = None,
+    horizon: Annotated[int | None, typer.Option(help="Frames to forecast.")] = None,
+    onto: Annotated[int | None, typer.Option(help="Switch to this movement.")] = None,
+    start: Annotated[int, typer.Option(help="Frame where the switch begins.")] = 20,
+    steps: Annotated[int, typer.Option(help="Frames that the switch takes.")] = 18,
+) -> None:
+    """Play a movement in a page: data, reconstruction, forecast with its spread, and a switch."""
+    from zoo.screening import screen
+
+    player = screen(
+        source,
+        data=data,
+        item=movement,
+        seen=seen,
+        horizon=horizon,
+        onto=onto,
+        start=start,
+        steps=steps,
+    )
+    player.save(output)
+    names = ", ".join(track.name for track in player.tracks)
+    print(f"{output}: {names}; {player.frames} frames. Open it in any browser.")
+
+
 @app.command()
 def experiment(
     identifier: Annotated[

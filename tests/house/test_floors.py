@@ -36,6 +36,7 @@ FLOORS = {
     "zoo.experiments": 5,
     "zoo.leaderboard": 5,
     "zoo.workflow": 5,
+    "zoo.screening": 5,
     "zoo.console": 6,
     "zoo.cli": 6,
     "zoo.demo": 6,

@@ -3,6 +3,17 @@
 from __future__ import annotations
 
 from zoo.player.bodies import Arm, Body, Human, body_for
+from zoo.player.page import Player, Track, play
 from zoo.player.postures import posture_map, posture_strip
 
-__all__ = ["Arm", "Body", "Human", "body_for", "posture_map", "posture_strip"]
+__all__ = [
+    "Arm",
+    "Body",
+    "Human",
+    "Player",
+    "Track",
+    "body_for",
+    "play",
+    "posture_map",
+    "posture_strip",
+]
