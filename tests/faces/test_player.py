@@ -153,7 +153,7 @@ def test_the_command_writes_a_page(
 
 @pytest.mark.skipif(BROWSER is None, reason="no chromium to open the page with")
 def test_a_browser_plays_it(tmp_path: Path, run: zoo.Run, arm: zoo.Sequences) -> None:
-    """Bodies are on the stage, time goes on, and the script runs without an error."""
+    """Bodies are on the stage, move with the time line, and the script runs without error."""
     page = screen_run(run, arm, seen=10).save(tmp_path / "arm.html")
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr"]
     options += ["--virtual-time-budget=1500", f"--user-data-dir={tmp_path / 'browser'}"]
@@ -168,7 +168,10 @@ def test_a_browser_plays_it(tmp_path: Path, run: zoo.Run, arm: zoo.Sequences) ->
         assert "CONSOLE" not in done.stderr
         return matplotlib.image.imread(shot)[50:400, 20:-20, :3]
 
-    assert 'data-frame="0"' in browse("--dump-dom", page.as_uri()).stdout
-    still, moving = stage(page.as_uri()), stage(f"{page.as_uri()}#play")
-    assert (abs(still - still[0, 0]).max(-1) > 0.2).mean() > 2e-3
-    assert (abs(still - moving).max(-1) > 0.2).mean() > 1e-3
+    begin, later = page.as_uri(), f"{page.as_uri()}#frame=60"
+    assert 'data-frame="0"' in browse("--dump-dom", begin).stdout
+    assert 'data-frame="60"' in browse("--dump-dom", later).stdout
+    assert ">Pause</button>" in browse("--dump-dom", f"{begin}#play").stdout
+    first, second = stage(begin), stage(later)
+    assert (abs(first - first[0, 0]).max(-1) > 0.2).mean() > 2e-3
+    assert (abs(first - second).max(-1) > 0.2).mean() > 1e-3
