@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from abc import abstractmethod
+from typing import Any, ClassVar, Self
 
 import torch
 from jaxtyping import Float
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.distributions import kl
 
-__all__ = ["FilteringNoise", "NoiseNetwork"]
+__all__ = ["FilteringNoise", "NoiseNetwork", "RecurrentNoise"]
 
 ROOT_SCALE = 0.1
 
@@ -125,17 +126,77 @@ def _contract(left: Tensor, right: Tensor) -> Tensor:
     return left.flatten(0, 1).t() @ right.flatten(0, 1)
 
 
-class FilteringNoise(TorchDistribution):
-    r"""q(ε̂_{2:T} | x, s_1): ε̂_{t+1} ~ N(μ(x_{t+1}, z_t), σ²(x_{t+1}, z_t)), (79), (84).
+class RecurrentNoise(TorchDistribution):
+    r"""Noise whose moments in every step depend on the state that the noise before led to.
 
-    The states between follow s_{t+1} = s_t A + drive_t + ε̂_{t+1} G. A draw is one recurrence in
-    plain torch with its adjoint written out; its moments are kept, so that its log density and its
-    divergence from a Gaussian prior cost nothing more.
+    A draw is one recurrence; its moments are kept, so that its log density and its divergence from
+    a Gaussian prior cost nothing more.
     """
 
     has_rsample = True
     arg_constraints: ClassVar[dict[str, Any]] = {}
     support = constraints.independent(constraints.real, 2)
+
+    def __init__(self, steps: int, windows: int, latent: int, like: Tensor) -> None:
+        """Noise of ``windows`` sub-sequences; ``like`` has its dtype and device."""
+        self._like = like
+        self._kept: tuple[Tensor, Tensor, Tensor] | None = None
+        super().__init__(torch.Size((windows,)), torch.Size((steps, latent)), validate_args=False)
+
+    @abstractmethod
+    def draw(self, η: Float[Tensor, "step window latent"]) -> tuple[Tensor, Tensor]:
+        """Noise and its standard deviations, from standard normal numbers, time-major."""
+        ...
+
+    @abstractmethod
+    def moments(
+        self, value: Float[Tensor, "window step latent"]
+    ) -> tuple[Float[Tensor, "step window latent"], Float[Tensor, "step window latent"]]:
+        """Mean and standard deviation of every step along the states that ``value`` leads to."""
+        ...
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> Self:
+        """The distribution itself: its windows are independent already."""
+        if torch.Size(batch_shape) != self.batch_shape:
+            raise ValueError(f"batch shape {batch_shape} for {tuple(self.batch_shape)} windows")
+        return self
+
+    def rsample(
+        self, sample_shape: Any = (), noise: Tensor | None = None
+    ) -> Float[Tensor, "window step latent"]:
+        """One reparameterised draw; ``noise`` η replaces the standard normal numbers."""
+        if tuple(sample_shape):
+            raise ValueError(f"one draw at a time; got sample_shape {tuple(sample_shape)}")
+        shape = (self.event_shape[0], self.batch_shape[0], self.event_shape[1])
+        η = torch.randn(shape, dtype=self._like.dtype, device=self._like.device)
+        η = η if noise is None else noise
+        ε, σ = self.draw(η)
+        value: Tensor = ε.transpose(0, 1)
+        self._kept = value, η, σ
+        return value
+
+    def log_prob(self, value: Float[Tensor, "window step latent"]) -> Float[Tensor, " window"]:
+        """Log density of ``value``, summed over steps and dimensions."""
+        if self._kept is not None and value is self._kept[0]:
+            _, η, σ = self._kept
+            return _log_normal(η, σ)
+        mean, std = self.moments(value)
+        return _log_normal((value.transpose(0, 1) - mean) / std, std)
+
+    def kept_moments(self) -> tuple[Tensor, Tensor]:
+        """Moments along the last draw, shape (step, window, latent)."""
+        if self._kept is None:
+            raise ValueError("no draw has been made")
+        value, η, σ = self._kept
+        return value.transpose(0, 1) - σ * η, σ
+
+
+class FilteringNoise(RecurrentNoise):
+    r"""q(ε̂_{2:T} | x, s_1): ε̂_{t+1} ~ N(μ(x_{t+1}, z_t), σ²(x_{t+1}, z_t)), (79), (84).
+
+    The states between follow s_{t+1} = s_t A + drive_t + ε̂_{t+1} G, in plain torch with the
+    adjoint written out.
+    """
 
     def __init__(
         self,
@@ -149,27 +210,12 @@ class FilteringNoise(TorchDistribution):
         """Noise of ``window`` sub-sequences, each ``step`` + 1 frames long."""
         self.network, self.features, self.state = network, features, state
         self.drive, self.transition, self.gain = drive, transition, gain
-        self._kept: tuple[Tensor, Tensor, Tensor] | None = None
-        event = (features.shape[0], gain.shape[0])
-        super().__init__(state.shape[:1], torch.Size(event), validate_args=False)
+        super().__init__(features.shape[0], state.shape[0], gain.shape[0], state)
 
-    def expand(self, batch_shape: Any, _instance: Any = None) -> FilteringNoise:
-        """The distribution itself: its windows are independent already."""
-        if torch.Size(batch_shape) != self.batch_shape:
-            raise ValueError(f"batch shape {batch_shape} for {tuple(self.batch_shape)} windows")
-        return self
-
-    def rsample(
-        self, sample_shape: Any = (), noise: Tensor | None = None
-    ) -> Float[Tensor, "window step latent"]:
-        """One reparameterised draw; ``noise`` η replaces the standard normal numbers."""
-        if tuple(sample_shape):
-            raise ValueError(f"one draw at a time; got sample_shape {tuple(sample_shape)}")
-        shape = (len(self.features), len(self.state), len(self.gain))
-        η = torch.randn(shape, dtype=self.state.dtype, device=self.state.device)
-        η = η if noise is None else noise
+    def draw(self, η: Float[Tensor, "step window latent"]) -> tuple[Tensor, Tensor]:
+        """The recurrence and its adjoint."""
         net = self.network
-        ε, σ = _Filter.apply(  # type: ignore[no-untyped-call]
+        found: tuple[Tensor, Tensor] = _Filter.apply(  # type: ignore[no-untyped-call]
             self.features,
             η,
             self.state,
@@ -181,17 +227,7 @@ class FilteringNoise(TorchDistribution):
             net.moments.bias,
             net.floor,
         )
-        value: Tensor = ε.transpose(0, 1)
-        self._kept = value, η, σ
-        return value
-
-    def log_prob(self, value: Float[Tensor, "window step latent"]) -> Float[Tensor, " window"]:
-        """Log density of ``value``, summed over steps and dimensions."""
-        if self._kept is not None and value is self._kept[0]:
-            _, η, σ = self._kept
-            return _log_normal(η, σ)
-        mean, std = self.moments(value)
-        return _log_normal((value.transpose(0, 1) - mean) / std, std)
+        return found
 
     def moments(
         self, value: Float[Tensor, "window step latent"]
@@ -205,21 +241,14 @@ class FilteringNoise(TorchDistribution):
         mean, std = self.network(self.features, z)
         return mean, std
 
-    def kept_moments(self) -> tuple[Tensor, Tensor]:
-        """Moments along the last draw, shape (step, window, latent)."""
-        if self._kept is None:
-            raise ValueError("no draw has been made")
-        value, η, σ = self._kept
-        return value.transpose(0, 1) - σ * η, σ
-
 
 def _log_normal(η: Tensor, σ: Tensor) -> Tensor:
     constant = 0.9189385332046727 * η.shape[0] * η.shape[2]
     return -(0.5 * η.square() + σ.log()).sum((0, 2)) - constant
 
 
-@kl.register_kl(FilteringNoise, torch.distributions.Independent)  # type: ignore[untyped-decorator]
-def _kl_filtering_prior(q: FilteringNoise, p: torch.distributions.Independent[Any]) -> Tensor:
+@kl.register_kl(RecurrentNoise, torch.distributions.Independent)  # type: ignore[untyped-decorator]
+def _kl_recurrent_prior(q: RecurrentNoise, p: torch.distributions.Independent[Any]) -> Tensor:
     """KL of every step given the state it starts from, along the draw: no noise of its own."""
     if not isinstance(p.base_dist, torch.distributions.Normal) or p.event_shape != q.event_shape:
         raise NotImplementedError

@@ -95,7 +95,7 @@ CATALOGUE = Registry(
             data="sequences",
             dataset="robot-arm/reaching",
             scaling="range",
-            config={"prior": "laplace", "prior_scale": 0.3},
+            config={"prior": "laplace", "prior_scale": 0.03, "weight_scale": 0.3},
         ),
         Entry(
             name="ae-then-dmp",
@@ -163,6 +163,16 @@ CATALOGUE = Registry(
             dataset="thesis-movements",
             scaling="center",
             config={"hidden": 120},
+        ),
+        Entry(
+            name="dvbf",
+            summary="Deep variational Bayes filter with a locally linear transition, and actions",
+            thesis="§6.2.1, (85)",
+            model="zoo.models.dvbf:Dvbf",
+            guide="zoo.guides.sequential:SequentialGuide",
+            inference=replace(_VAE_DMP, window=20, epochs=300, learning_rate=1e-3, clip=10.0),
+            data="sequences",
+            dataset="robot-arm/reaching",
         ),
         Entry(
             name="gp",

@@ -112,13 +112,18 @@ class Imitator:
         self,
         theta: Float[Tensor, "*batch parameter latent"],
         goal: Float[Tensor, "*batch latent"],
-        slack: float = 1e-2,
     ) -> Float[Tensor, "*batch parameter latent"]:
-        """Another goal, the forcing term multiplied by (g' − y₁)/(g − y₁), §5.3.6."""
-        old, new = theta[..., GOAL, :] - theta[..., 0, :], goal - theta[..., 0, :]
-        ratio = ((new * old + slack) / (old.square() + slack))[..., None, :]
-        forces = theta[..., WEIGHTS:, :] * ratio
-        return torch.cat([theta[..., :GOAL, :], goal[..., None, :], forces], dim=-2)
+        """The goal attractor moved so that the path ends at ``goal``; forces stay, §5.3.6.
+
+        >>> imitator = Imitator(frames=70, kernels=20)
+        >>> θ = imitator.aimed(torch.randn(23, 2), torch.tensor([1.0, -2.0]))
+        >>> imitator.roll_out(θ)[-1].round(decimals=4)
+        tensor([ 1., -2.])
+        """
+        end = _design(self)[-1].to(theta)
+        moved = theta.clone()
+        moved[..., GOAL, :] += (goal - end @ theta) / end[GOAL]
+        return moved
 
 
 @lru_cache(maxsize=16)

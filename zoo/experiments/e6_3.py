@@ -26,7 +26,7 @@ __all__ = ["MODELS", "box", "decoded", "fitted", "run"]
 
 FLAT = "VAE-DMP, flat"
 MODELS: dict[str, tuple[str, dict[str, Any]]] = {
-    FLAT: ("vae-dmp", {"activation": "tanh", "flatness": 1000.0, "epochs": 3000}),
+    FLAT: ("vae-dmp", {"activation": "tanh", "flatness": 3000.0, "epochs": 3000}),
     "VAE-DMP, tanh": ("vae-dmp", {"activation": "tanh", "epochs": 3000}),
     "VAE-DMP": ("vae-dmp", {}),
     "VAE": ("vae", {}),
@@ -160,7 +160,7 @@ def _result(
         cards=(
             {
                 "model": "vae-dmp",
-                "what": "largest to smallest ‖dx/dz‖ in 2-D, with flatness=1000",
+                "what": "largest to smallest ‖dx/dz‖ in 2-D, with flatness=3000",
                 "value": f"{ratios[FLAT]:.2f}",
                 "thesis": f"{THESIS[1] / THESIS[0]:.2f}",
             },

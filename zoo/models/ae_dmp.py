@@ -34,7 +34,9 @@ class Config:
     ``hidden`` are the layers from a frame to the latent space, mirrored in the decoder;
     ``penalty`` is λ of (72), forces in units of αβ; ``pretraining`` the share of the training in
     which the autoencoder learns alone, 1 for two stages that are never joined; ``prior`` and
-    ``prior_scale`` that of y, whose ``laplace`` has η = 1/``prior_scale`` in (73); ``chain`` the
+    ``prior_scale`` that of y, whose ``laplace`` has η = 1/``prior_scale`` in (73); ``weight_scale``
+    the prior standard deviation of the decoder's weights (None: flat), without which a small y with
+    large weights escapes the prior of y; ``chain`` the
     steps k of §5.3.4; ``noise_std`` where σ starts, never below ``noise_floor``, in scaled units.
     """
 
@@ -47,6 +49,7 @@ class Config:
     pretraining: float = 0.3
     prior: Literal["normal", "laplace"] = "normal"
     prior_scale: float = 1.0
+    weight_scale: float | None = None
     chain: int = 4
     noise_std: float = 0.3
     noise_floor: float = 1e-3
@@ -57,8 +60,8 @@ class Config:
         for name, least in (("latent_dim", 1), ("kernels", 2), ("chain", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
-        for name in ("penalty", "prior_scale", "noise_std", "noise_floor"):
-            if not getattr(self, name) > 0:
+        for name in ("penalty", "prior_scale", "weight_scale", "noise_std", "noise_floor"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
         if not 0 <= self.pretraining <= 1:
             raise ValueError(f"pretraining must be in [0, 1]; got {self.pretraining}")
@@ -127,6 +130,8 @@ class AeDmp(nn.Module):
         prior = PRIORS[self.config.prior](zero, zero + self.config.prior_scale)
         weights = dist.Normal(zero, zero + 1.0)
         θ_shape = [windows, self.config.kernels + 3, self.latent_dim]
+        if self.config.weight_scale is not None:
+            pyro.factor("weights", self._weight_prior(self.config.weight_scale))
         with pyro.plate("windows", size=batch.total, subsample=torch.arange(windows)):
             y = pyro.sample("y", prior.expand([windows, time, self.latent_dim]).to_event(2))
             θ = pyro.sample("theta", weights.expand(θ_shape).to_event(2))
@@ -137,6 +142,11 @@ class AeDmp(nn.Module):
                 f, f_target = self.imitator.forces(y, θ)
                 force = dist.Normal(f, self.σ / self.config.penalty**0.5)
                 pyro.sample("f", force.mask(_steps(batch.mask)).to_event(2), obs=f_target)
+
+    def _weight_prior(self, scale: float) -> Float[Tensor, ""]:
+        """log p of the decoder's weights, N(0, ``scale``²) each, up to a constant."""
+        weights = [p for p in self.decoder.parameters() if p.ndim == 2]
+        return -torch.stack([w.square().sum() for w in weights]).sum() / (2 * scale**2)
 
     def imitate(
         self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None

@@ -25,6 +25,7 @@ from zoo.types import Batch, Layout
 __all__ = ["Config", "LatentDmp"]
 
 ALPHA, ALPHA_FRAME = 25.0, 0.4
+BEYOND = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +44,10 @@ class Config:
     are straight in latent space, and the decoder has to bend them; None: 1, about 0.
 
     ``flatness`` is the weight η of a prior p(g) ∝ exp(−η (‖J‖²/c² − 1)²) on the decoder, J = dx/dz
-    and c² its mean square, at points all over the box that the paths of a batch span: equal steps
-    in latent space are then equal movements, also between the movements known (after Chen et al.,
-    *Learning flat latent manifolds with VAEs*, ICML 2020). It needs a smooth ``activation``.
+    and c² its mean square, at points all over the box that the paths of a batch span, and a tenth
+    beyond: equal steps in latent space are then equal movements, also between the movements known
+    (after Chen et al., *Learning flat latent manifolds with VAEs*, ICML 2020). It needs a smooth
+    ``activation``.
     """
 
     latent_dim: int = 5
@@ -154,7 +156,8 @@ class LatentDmp(nn.Module):
     def flatness_prior(self, path: Float[Tensor, "window time latent"]) -> Float[Tensor, " window"]:
         """log p(g) up to a constant, −η (‖J‖²/c² − 1)² at a random point for each window."""
         low, high = (edge(path.detach(), (0, 1)) for edge in (torch.amin, torch.amax))
-        points = low + (high - low) * torch.rand(len(path), self.latent_dim).to(path)
+        share = (1 + 2 * BEYOND) * torch.rand(len(path), self.latent_dim).to(path) - BEYOND
+        points = torch.lerp(low, high, share)
         size = jacobians(self.decoder, points).square().sum((-1, -2))
         return -self.config.flatness * (size / size.mean() - 1).square()
 
