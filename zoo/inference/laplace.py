@@ -14,7 +14,7 @@ from zoo.nn.metric import jacobians
 __all__ = ["laplace"]
 
 ITERATIONS, DAMPING = 50, 1e-2
-ENOUGH = 3.0
+ALIKE, ENOUGH = 2.0, 6.0
 
 
 def laplace(
@@ -27,9 +27,10 @@ def laplace(
 ) -> MultivariateNormal:
     r"""p(z | x) of z ~ N(0, I), x ~ N(decode(z), diag std²), as a Gaussian at its mode.
 
-    The mode is sought by Levenberg and Marquardt's method from ``start`` and, where that leaves
-    more than three standard deviations of x unexplained, from ``restarts`` draws of the prior; the
-    covariance is (I + JᵀJ/σ²)⁻¹ with the Jacobian J of ``decode`` there (Gauss–Newton). An
+    Modes are sought by Levenberg and Marquardt's method from ``start`` and from ``restarts`` draws
+    of the prior. Of those that miss x by no more than twice what the best does, or by six standard
+    deviations, the nearest to ``start`` is taken: what a decoder maps alike is told apart by that.
+    The covariance is (I + JᵀJ/σ²)⁻¹ with the Jacobian J of ``decode`` there (Gauss–Newton). An
     amortised encoder knows only frames like those of the training; this asks the decoder itself.
 
     >>> known = laplace(lambda z: 2 * z, torch.zeros(1, 1), torch.ones(1, 1), torch.ones(1))
@@ -39,8 +40,10 @@ def laplace(
     begin = torch.cat([start[None], torch.randn(restarts, *start.shape).to(start)])
     z = _modes(decode, begin.flatten(0, 1), x.repeat(1 + restarts, 1), std)
     losses = _loss(decode, z, x.repeat(1 + restarts, 1), std).view(1 + restarts, -1)
-    fits = losses[0] < x.shape[-1] * ENOUGH**2
-    best = torch.where(fits, 0, losses.argmin(0))[None, :, None].expand(1, *start.shape)
+    enough = (ALIKE**2 * losses.amin(0)).clamp(min=ENOUGH**2 * x.shape[-1])
+    apart = (z.view(begin.shape) - start).square().sum(-1)
+    apart = apart.masked_fill(losses > enough, torch.inf)
+    best = apart.argmin(0)[None, :, None].expand(1, *start.shape)
     mode = z.view(begin.shape).gather(0, best)[0]
     J = jacobians(decode, mode) / std[:, None]
     eye = torch.eye(start.shape[-1], dtype=start.dtype, device=start.device)
