@@ -12,12 +12,13 @@ from jaxtyping import Bool, Float
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
+from zoo.dynamics.plan import Plan
 from zoo.guides.recurrence import FilteringNoise, NoiseNetwork
 from zoo.nn.mlp import trunk
 from zoo.nn.moments import GaussianHead
 from zoo.types import Batch, Layout
 
-__all__ = ["Config", "FilteringGuide", "LatentDynamics"]
+__all__ = ["Config", "FilteringGuide", "LatentDynamics", "normal"]
 
 ROOT_SCALE = 0.1
 
@@ -45,14 +46,8 @@ class LatentDynamics(Protocol):
         """State of a window's first frame."""
         ...
 
-    def drive(
-        self,
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
-        batch: Batch,
-        start: Float[Tensor, "sequence latent"] | None = None,
-    ) -> Float[Tensor, "step window state"]:
-        """What goal and forcing term add in every step of every window; ``start`` if it scales."""
+    def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
+        """What goal and forcing term add in every step of every window."""
         ...
 
 
@@ -101,41 +96,56 @@ class FilteringGuide(nn.Module):
         )
         self.g_1 = nn.Sequential(nn.Linear(channels, config.features), nn.Softmax(dim=-1))
         width = 1 if config.weights == "point" else 2
-        self.g_2 = nn.Linear(model.frames * config.features, width * weights * latent)
+        self.g_2 = nn.Linear(self.places * config.features, width * weights * latent)
 
     def forward(self, batch: Batch) -> None:
         """The Pyro program of all latent sites."""
         model = self._dynamics
-        rows, windows = len(batch.movements), len(batch)
-        with pyro.plate("movements", batch.total_sequences, subsample=torch.arange(rows)):
-            w = pyro.sample("w", self.weights(batch.movements))
-            goal = pyro.sample("goal", _normal(self._encode(batch.movements[:, -1]), 1))
-            start = None
-            if model.goal_scaling:
-                start = pyro.sample("start", _normal(self._encode(batch.movements[:, 0]), 1))
+        rows, windows = torch.arange(len(batch.movements)), len(batch)
+        with pyro.plate("movements", batch.total_sequences, subsample=rows):
+            plan = self.plan(batch)
         h = self.trunk(batch.values)
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
-            z = pyro.sample("z", _normal(self.encoder(h), 2))
-            velocity = pyro.sample("velocity", _normal(self._velocity(h), 1))
+            z = pyro.sample("z", normal(self.encoder(h), 2))
+            velocity = pyro.sample("velocity", normal(self._velocity(h), 1))
             noise = FilteringNoise(
                 self.noise,
                 self.noise.features(batch.values.transpose(0, 1)[1:]),
                 model.initial_state(z[:, 0], velocity),
-                model.drive(w, goal, batch, start),
+                model.drive(plan, batch),
                 model.transition,
                 model.noise_gain(),
             )
             pyro.sample("epsilon", noise)
 
+    def plan(self, batch: Batch) -> Plan:
+        """What is recognised of whole movements."""
+        x = batch.movements
+        w = pyro.sample("w", self.weights(x))
+        goal = pyro.sample("goal", normal(self._encode(x[:, -1]), 1))
+        start = None
+        if self._dynamics.goal_scaling:
+            start = pyro.sample("start", normal(self._encode(x[:, 0]), 1))
+        return Plan(w=w, goal=goal, start=start)
+
+    @property
+    def places(self) -> int:
+        """Number of places of a movement whose features make w."""
+        return self._dynamics.frames
+
     def weights(self, movements: Float[Tensor, "sequence frame channel"]) -> TorchDistribution:
-        """q(w | x_{1:n}) of (88): MLP_w and, for a Gaussian, its standard deviations."""
-        g = self.g_2(self.g_1(movements).flatten(1))
-        shape = (len(movements), -1, self._dynamics.latent_dim)
+        """q(w | x_{1:n}) of (88)."""
+        return self.forcing(self.g_1(movements))
+
+    def forcing(self, features: Float[Tensor, "sequence place feature"]) -> TorchDistribution:
+        """q(w) of features g_1: MLP_w and, for a Gaussian, its standard deviations."""
+        g = self.g_2(features.flatten(1))
+        shape = (len(features), -1, self._dynamics.latent_dim)
         if self.config.weights == "point":
             point: TorchDistribution = dist.Delta(g.view(shape)).to_event(2)
             return point
         mean, root = g.chunk(2, dim=1)
-        return _normal((mean.view(shape), (root.view(shape) + ROOT_SCALE).square() + 1e-3), 2)
+        return normal((mean.view(shape), (root.view(shape) + ROOT_SCALE).square() + 1e-3), 2)
 
     def encode(
         self,
@@ -168,6 +178,7 @@ def _head(inputs: int, outputs: int, std: float) -> GaussianHead:
     return head
 
 
-def _normal(moments: tuple[Tensor, Tensor], events: int) -> TorchDistribution:
-    normal: TorchDistribution = dist.Normal(*moments, validate_args=False).to_event(events)
-    return normal
+def normal(moments: tuple[Tensor, Tensor], events: int) -> TorchDistribution:
+    """Independent Gaussians whose last ``events`` axes belong together."""
+    found: TorchDistribution = dist.Normal(*moments, validate_args=False).to_event(events)
+    return found

@@ -118,7 +118,7 @@ CATALOGUE = Registry(
             inference=Exact(),
             data="sequences",
             dataset="cmu-mocap/35-walk",
-            config={"kind": "rhythmic", "kernels": 12, "synergies": 8},
+            config={"kind": "rhythmic", "kernels": 12},
         ),
         Entry(
             name="vae",
@@ -163,6 +163,17 @@ CATALOGUE = Registry(
             dataset="thesis-movements",
             scaling="center",
             config={"hidden": 120},
+        ),
+        Entry(
+            name="vae-dmp-rhythmic",
+            summary="VAE-DMP whose latent paths are limit cycles of any phase and tempo",
+            thesis="§6.2 with (57), (58)",
+            model="zoo.models.vae_dmp_rhythmic:RhythmicVaeDmp",
+            guide="zoo.guides.rhythmic:RhythmicGuide",
+            inference=replace(_VAE_DMP, window=20, stride=5, epochs=600),
+            data="sequences",
+            dataset="cmu-mocap/35-walk",
+            scaling="center",
         ),
         Entry(
             name="dvbf",

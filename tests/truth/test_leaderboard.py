@@ -108,7 +108,7 @@ def test_a_repeated_command_takes_what_was_found(tiny: Protocol, tmp_path: Path)
     assert stored["details"]["scores"]["mean"]["mse"]
     damaged = next(iter(stamps))
     damaged.write_text("{}")
-    assert table().rows == first.rows
+    assert [row[:-1] for row in table().rows] == [row[:-1] for row in first.rows]
     assert damaged.stat().st_mtime_ns != stamps[damaged]
     table(seeds=2)
     assert len(list((tmp_path / "cells").rglob("cell.json"))) == 2 * len(stamps)

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from zoo.datasets.records import Sequences
 from zoo.dynamics.dmp import Response
-from zoo.dynamics.paths import PathPrior, Readout, _stationary
+from zoo.dynamics.gaussian_paths import stationary
+from zoo.dynamics.paths import PathPrior, Readout
+from zoo.dynamics.plan import Plan
 from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.filtering import FilteringGuide
 from zoo.guides.recurrence import FilteringNoise, _Filter
@@ -304,7 +306,7 @@ def prior(movements: int = 3, time: int = 6) -> PathPrior:
 def test_stationary_covariance_equals_the_mean_over_lags():
     torch.manual_seed(8)
     r = torch.randn(3, 5, LATENT)
-    found = _stationary(r)
+    found = stationary(r)
     for t in range(5):
         for s in range(5):
             lag = s - t
@@ -388,8 +390,9 @@ def test_prior_of_movements_holds_the_paths_of_the_response():
         u = torch.cat([found.w[0], *(v.transpose(0, 1) for v in (found.goal, found.position))], 1)
         model.prior_movements = torch.cat([u, found.velocity.transpose(0, 1)], 1)
         model.prior_residuals.zero_()
-        args = one["z"][:, 0], one["velocity"], one["w"], one["goal"], 0 * one["epsilon"]
-        torch.testing.assert_close(model._prior(FRAMES).paths, model.path(*args, batch))
+        plan, still = Plan(w=one["w"], goal=one["goal"]), 0 * one["epsilon"]
+        path = model.path(one["z"][:, 0], one["velocity"], plan, still, batch)
+        torch.testing.assert_close(model._prior(FRAMES).paths, path)
 
 
 def test_a_section_is_imputed_alike_by_one_factorisation_and_by_one_for_each_movement():

@@ -12,7 +12,7 @@ from zoo.dynamics.rollout import Timing
 from zoo.dynamics.sums import Movements
 from zoo.dynamics.weights import Basis
 
-__all__ = ["BasisOf", "align", "possible"]
+__all__ = ["BasisOf", "align", "durations"]
 
 BasisOf = Callable[[int, Timing], Basis]
 
@@ -35,14 +35,12 @@ def align(
     return timings
 
 
-def possible(kind: str, found: Sequence[Timing], count: int) -> list[Timing]:
-    """Timings that a new movement may have: all, or ``count`` of the durations of discrete ones.
+def durations(found: Sequence[Timing], count: int) -> list[Timing]:
+    """At most ``count`` of the durations of movements, evenly ranked.
 
-    >>> [t.unit for t in possible("discrete", [Timing(5.0), Timing(9.0), Timing(6.0)], 2)]
+    >>> [t.unit for t in durations([Timing(5.0), Timing(9.0), Timing(6.0)], 2)]
     [5.0, 9.0]
     """
-    if kind == "rhythmic":
-        return list(found)
     units = sorted({t.unit for t in found})
     ranks = torch.linspace(0, len(units) - 1, min(count, len(units))).round().int().tolist()
     return [Timing(units[rank]) for rank in ranks]

@@ -244,15 +244,16 @@ def rhythmic_basis(
     time: Float[Tensor, "*time"],
     *,
     kernels: int,
-    period: float,
-    offset: float = 0.0,
+    period: float | Tensor,
+    offset: float | Tensor = 0.0,
     spread: float = SPREAD,
     normalised: bool = True,
 ) -> Float[Tensor, "*time kernel"]:
     """Ψ_i(s)/ΣΨ of the rhythmic system (57), (58); s grows by 2π in a ``period``.
 
     Centres are equally spaced on the circle, h = 1/(``spread`` × distance)²; ``offset`` in rad is
-    the phase at time 0; Ψ_i alone comes with ``normalised=False``.
+    the phase at time 0; both may be tensors that broadcast with ``time``; Ψ_i alone comes with
+    ``normalised=False``.
 
     >>> rows = rhythmic_basis(torch.tensor([0.0, 30.0, 60.0]), kernels=8, period=30)
     >>> bool((rows[0] - rows[2]).abs().max() < 1e-5)

@@ -11,15 +11,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from zoo.dynamics.gaussian_paths import block_diagonal, cholesky, stationary
+
 __all__ = ["Conditioned", "PathPrior", "Readout"]
 
 CHOICES = {
-    "bandwidth": (0.1, 0.3, 0.6, 1.0),
+    "bandwidth": (0.1, 0.3, 0.6, 0.8, 1.0),
     "shrinkage": (0.01, 0.1, 0.5),
     "process": (0.03, 0.3, 1.0),
 }
 LEFT_OUT = 8
-JITTER = 1e-8
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class PathPrior:
         if movements > 1:
             apart = (self.paths - self.paths.mean(0)) / math.sqrt(movements - 1)
             shared = shared + (1 - self.shrinkage) * torch.einsum("mti,msj->tisj", apart, apart)
-        return self.bandwidth**2 * shared + self.process * _stationary(self.residuals)
+        return self.bandwidth**2 * shared + self.process * stationary(self.residuals)
 
     def condition(
         self,
@@ -96,7 +97,7 @@ class PathPrior:
         full = self.covariance.reshape(time * latent, time * latent)
         rows = where.repeat_interleave(latent).nonzero()[:, 0]
         noise = self.observation if extra is None else self.observation + extra[..., where, :, :]
-        factor = _cholesky(full[rows][:, rows] + _block_diagonal(noise, int(where.sum())))
+        factor = cholesky(full[rows][:, rows] + block_diagonal(noise, int(where.sum())))
         half = torch.linalg.solve_triangular(factor, full[rows], upper=False)
         means = self.means.flatten(1)
         apart = seen.flatten(-2)[..., None, rows] - means[:, rows]
@@ -151,6 +152,15 @@ class Readout:
         """The read-out along one of the movements."""
         return replace(self, jacobian=self.jacobian[movement])
 
+    def density_of_draws(
+        self, apart: Float[Tensor, "sample time latent"]
+    ) -> Float[Tensor, "time channel"]:
+        """Log density of the truth under draws that lie ``apart`` from its path, as Gaussians."""
+        x = torch.einsum("tci,sti->stc", self.jacobian, apart)
+        std = (x.var(0) + self.std.square()).sqrt()
+        density: Tensor = torch.distributions.Normal(x.mean(0), std).log_prob(torch.zeros_like(std))
+        return density
+
 
 @dataclass(frozen=True)
 class Conditioned:
@@ -168,7 +178,7 @@ class Conditioned:
         index = picks[..., None, None, None].expand(*picks.shape, 1, time, latent)
         centre = means.gather(-3, index).squeeze(-3)
         white = torch.randn(*picks.shape, time * latent, dtype=self.covariance.dtype)
-        moved = white.movedim(0, -2) @ _cholesky(self.covariance).mT
+        moved = white.movedim(0, -2) @ cholesky(self.covariance).mT
         path: Tensor = centre + moved.movedim(-2, 0).unflatten(-1, (time, latent))
         return path
 
@@ -186,34 +196,5 @@ class Conditioned:
         return torch.logsumexp(joint, dim=0)
 
 
-def _stationary(
-    residuals: Float[Tensor, "movement time latent"],
-) -> Float[Tensor, "time latent time latent"]:
-    """Covariance of stationary residuals from their correlation at every lag (never indefinite)."""
-    count, time, _ = residuals.shape
-    spectrum = torch.fft.rfft(residuals, n=2 * time, dim=1)
-    power = torch.einsum("mfi,mfj->fij", spectrum.conj(), spectrum)
-    lags = torch.fft.irfft(power, n=2 * time, dim=0) / (count * time)
-    step = torch.arange(time)
-    covariance: Tensor = lags[(step - step[:, None]) % (2 * time)]
-    return covariance.permute(0, 2, 1, 3)
-
-
 def _eye(matrix: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
     return torch.eye(len(matrix), dtype=matrix.dtype)
-
-
-def _block_diagonal(
-    block: Float[Tensor, "*batch latent latent"], frames: int
-) -> Float[Tensor, "*batch path path"]:
-    """One block for all frames, or a block for each."""
-    latent = block.shape[-1]
-    each = block.expand(*block.shape[:-3], frames, latent, latent)
-    wide = each.unsqueeze(-2) * torch.eye(frames, dtype=block.dtype)[:, None, :, None]
-    return wide.flatten(-2).flatten(-3, -2)
-
-
-def _cholesky(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
-    relative = 1 + JITTER * torch.eye(matrix.shape[-1], dtype=matrix.dtype)
-    factor: Tensor = torch.linalg.cholesky((matrix + matrix.mT) / 2 * relative)
-    return factor

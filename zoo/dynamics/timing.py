@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,10 +13,12 @@ from zoo.dynamics.evidence import FLOOR
 from zoo.dynamics.rollout import Primitive, Timing, path_noise, roll_out, sight
 from zoo.dynamics.sums import Movements, of_weights, sums_of, uniform
 
-__all__ = ["anchors", "period_of", "phases", "timings_of"]
+__all__ = ["anchors", "expected", "period_of", "phases", "tempos", "timings_of"]
 
 PHASES = 16
 TEMPOS = (1.0, 0.8, 0.9, 1.1, 1.25)
+FINE = (1.0, *(1.25 ** (k / 10) for k in range(-10, 11) if k))
+TEMPO_SPREAD = 0.03
 
 
 def anchors(
@@ -63,11 +66,37 @@ def period_of(movements: Movements) -> float:
     return float(begin + int(tail.argmax()))
 
 
-def phases(period: float) -> list[Timing]:
+def phases(period: float, tempos: Sequence[float] = TEMPOS, count: int = PHASES) -> list[Timing]:
     """Timings that a rhythmic movement may have: tempos around ``period``, all over the circle."""
     return [
-        Timing(period * tempo, 2 * math.pi * i / PHASES) for tempo in TEMPOS for i in range(PHASES)
+        Timing(period * tempo, 2 * math.pi * i / count) for tempo in tempos for i in range(count)
     ]
+
+
+def tempos(
+    periods: Float[Tensor, " movement"], count: int
+) -> tuple[float, Float[Tensor, " count"]]:
+    """Middle of some periods, and ``count`` equally likely tempos about it of a new movement.
+
+    Log periods are Gaussian, about their mean; their spread is that of the movements and the 3 %
+    by which a tempo changes within one.
+
+    >>> middle, around = tempos(torch.tensor([100.0, 110.0, 121.0]), 3)
+    >>> round(middle, 6), around.mul(100).round().tolist()
+    (110.0, [90.0, 100.0, 112.0])
+    """
+    log = periods.double().log()
+    between = log.var(correction=1) if len(log) > 1 else log.new_zeros(())
+    spread = (between * (1 + 1 / len(log)) + TEMPO_SPREAD**2).sqrt()
+    levels = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    around = (spread * torch.special.ndtri(levels)).exp()
+    return float(log.mean().exp()), around
+
+
+def expected(found: Sequence[Timing], count: int, directions: int = PHASES) -> list[Timing]:
+    """Equally likely timings of a new rhythmic movement, after those ``found`` of others."""
+    middle, around = tempos(torch.tensor([t.unit for t in found]), count)
+    return phases(middle, around.tolist(), directions)
 
 
 def timings_of(primitive: Primitive, movements: Movements, period: float | None) -> list[Timing]:

@@ -18,7 +18,14 @@ from zoo.inference.svi import fit_svi
 from zoo.strategies import Exact, Inference, MarginalLikelihood, Svi
 from zoo.types import Batch, Posterior
 
-__all__ = ["Conditions", "LearnsPrior", "MaximisesEvidence", "Session", "train_model"]
+__all__ = [
+    "Conditions",
+    "LearnsPrior",
+    "MaximisesEvidence",
+    "Prepares",
+    "Session",
+    "train_model",
+]
 
 
 @runtime_checkable
@@ -36,6 +43,15 @@ class MaximisesEvidence(Conditions, Protocol):
 
     def objective(self) -> Tensor:
         """Negative log evidence of the data last given to ``condition``."""
+        ...
+
+
+@runtime_checkable
+class Prepares(Protocol):
+    """A model or guide with constants that are read off the training data before all else."""
+
+    def prepare(self, data: Any) -> None:
+        """Fill buffers, such as a period; the model comes before its guide."""
         ...
 
 
@@ -116,6 +132,9 @@ def _variational(
 ) -> list[dict[str, Any]]:
     if guide is None:
         raise TypeError(f"{type(model).__name__} has no guide to train by variational inference")
+    for part in (model, guide):
+        if isinstance(part, Prepares):
+            part.prepare(train)
     history = fit_svi(
         model,
         guide,

@@ -14,13 +14,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.datasets.records import Sequences
+from zoo.dynamics.alignment import durations
 from zoo.dynamics.components import Components, Paths, alike, ramp, resample
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.imitation import trajectory_matrix
 from zoo.dynamics.learning import Learning, learn
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Primitive, Sight, Timing, path_noise, roll_out, sight
-from zoo.dynamics.timing import phases
+from zoo.dynamics.timing import TEMPOS, expected
 from zoo.errors import NotFittedError
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -379,11 +380,5 @@ def _seen(batch: Batch) -> Bool[Tensor, "sequence time channel"]:
 
 
 def _hypotheses(kind: str, timings: Sequence[Timing]) -> list[Timing]:
-    """Timings that a new movement may have: durations seen, or all phases of the period."""
-    if kind == "rhythmic":
-        return phases(timings[0].unit)
-    units = sorted({t.unit for t in timings})
-    if len(units) > COMPONENTS:
-        ranks = torch.linspace(0, len(units) - 1, COMPONENTS).round().int().tolist()
-        units = [units[rank] for rank in ranks]
-    return [Timing(unit) for unit in units]
+    """Timings that a new movement may have: durations seen, or tempos about those seen."""
+    return expected(timings, len(TEMPOS)) if kind == "rhythmic" else durations(timings, COMPONENTS)

@@ -18,6 +18,7 @@ from zoo.dynamics.dmp import (
     input_vector,
     transition_matrix,
 )
+from zoo.dynamics.plan import Plan
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp
 from zoo.types import Batch, Layout
@@ -171,48 +172,40 @@ class LatentDmp(nn.Module):
         """(z*_1, ż_1) of a window's first frame."""
         return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
 
-    def forces(
-        self,
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
-        batch: Batch,
-        start: Float[Tensor, "sequence latent"] | None = None,
-    ) -> Float[Tensor, "step window latent"]:
+    def forces(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window latent"]:
         """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
         steps = batch.values.shape[1] - 1
-        goal = self.embed(goal)
-        w = self.scaled(w, goal, None if start is None else self.embed(start))
-        pull = goal + torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+        goal = self.embed(plan.goal)
+        w = self.scaled(plan.w, goal, None if plan.start is None else self.embed(plan.start))
+        pull = goal + self.forcing(w, plan)
         at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
         row = at * pull.shape[1] + batch.sequence
         picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
         return picked.view(steps, len(batch), -1)
 
-    def drive(
-        self,
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
-        batch: Batch,
-        start: Float[Tensor, "sequence latent"] | None = None,
-    ) -> Float[Tensor, "step window state"]:
+    def forcing(
+        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
+    ) -> Float[Tensor, "step sequence latent"]:
+        """f_t in units of αβ of every step of whole movements, time-major."""
+        return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+
+    def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
         """What goal and forcing term add to the state in every step, (77)."""
-        return self.forces(w, goal, batch, start) @ self.step_input
+        return self.forces(plan, batch) @ self.step_input
 
     def path(
         self,
         z: Float[Tensor, "window latent"],
         velocity: Float[Tensor, "window latent"],
-        w: Float[Tensor, "sequence kernel latent"],
-        goal: Float[Tensor, "sequence latent"],
+        plan: Plan,
         ε: Float[Tensor, "window step latent"],
         batch: Batch,
-        start: Float[Tensor, "sequence latent"] | None = None,
     ) -> Float[Tensor, "window time latent"]:
         """z*_{1:T} by the linear response of (75): no loop over time."""
         steps = batch.values.shape[1]
         response = Response.of(self.system, steps, z.dtype, z.device)
         noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
-        force = self.forces(w, goal, batch, start) + noise
+        force = self.forces(plan, batch) + noise
         begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
         states = response.product(begin.flatten(1), force.flatten(1))
         return states[0].view(steps, len(batch), -1).transpose(0, 1)

@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.dynamics.alignment import align, possible
+from zoo.dynamics.alignment import align, durations
 from zoo.dynamics.components import Components, Paths, alike, ramp, resample
 from zoo.dynamics.dmp import discrete_basis, rhythmic_basis
 from zoo.dynamics.rollout import Timing
 from zoo.dynamics.sums import Movements
 from zoo.dynamics.synergies import synergies_of
-from zoo.dynamics.timing import period_of, phases
+from zoo.dynamics.timing import FINE, expected, period_of, phases
 from zoo.dynamics.weight_learning import View, learn, views_of
 from zoo.dynamics.weights import Basis, Weights, superposed
 from zoo.models.baseline import check_fitted, movement_groups, movements_of, seen_entries
@@ -30,6 +30,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["Config", "ProMP"]
 
 COMPONENTS = 16
+TEMPOS, PHASES = 9, 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,7 +133,7 @@ class ProMP(nn.Module):
         rhythmic = self.config.kind == "rhythmic"
         timings = align(self.basis, inside, choices) if rhythmic else choices
         self._keep(views_of(self.basis, inside, timings), movement_groups(movements))
-        kept = possible(self.config.kind, choices, COMPONENTS)
+        kept = expected(timings, TEMPOS, PHASES) if rhythmic else durations(timings, COMPONENTS)
         self.units = self.mean.new_tensor([t.unit for t in kept])
         self.offsets = self.mean.new_tensor([t.offset for t in kept])
 
@@ -224,7 +225,8 @@ class ProMP(nn.Module):
         if self.config.kind == "discrete":
             return [Timing(max(1.0, len(x) - 1.0)) for x, _ in movements]
         period = self.config.period
-        return phases(period_of(movements) if period is None else period * (rate or 1.0))
+        middle = period_of(movements) if period is None else period * (rate or 1.0)
+        return phases(middle, FINE, PHASES)
 
     def _keep(self, views: list[View], group: Tensor) -> None:
         c, n = self.config, max(2, len(group.unique()))

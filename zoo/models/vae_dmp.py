@@ -13,18 +13,18 @@ from torch import Tensor, nn
 from zoo.dynamics.components import ramp
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.paths import Conditioned, PathPrior, Readout
+from zoo.dynamics.plan import Plan
 from zoo.errors import NotFittedError
-from zoo.inference.chain import conditional_draws
 from zoo.inference.laplace import laplace
 from zoo.models.latent_dmp import Config, LatentDmp
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
-__all__ = ["Config", "VaeDmp"]
+__all__ = ["Config", "Latents", "VaeDmp"]
 
 _LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape")
 PRIOR_DRAWS = 32
-CHAINS, BURN_IN, KEPT = 8, 24, 64
+RESTARTS, KEPT = 4, 64
 UNSEEN = 1e6
 GOAL_SLACK = 1e-2
 
@@ -45,7 +45,8 @@ class VaeDmp(LatentDmp):
 
     Forecasts and imputation know neither w nor goal of a new movement: after training the latents
     of the training movements become a mixture over latent paths, which is conditioned exactly on
-    the frames seen (:class:`~zoo.dynamics.paths.PathPrior`). Movements must have one common length.
+    the frames seen (:class:`~zoo.dynamics.paths.PathPrior`). A frame seen in part is a Gaussian at
+    the mode of p(z | x_seen), which the decoder gives. Movements must have one common length.
     N. Chen, M. Karl, P. van der Smagt, *Dynamic movement primitives in latent space of
     time-dependent variational autoencoders*, Humanoids 2016.
     """
@@ -68,16 +69,12 @@ class VaeDmp(LatentDmp):
         unit = dist.Normal(self.basis.new_zeros(()), self.basis.new_ones(()), validate_args=False)
         rows = len(batch.movements)
         with pyro.plate("movements", batch.total_sequences, subsample=torch.arange(rows)):
-            w = pyro.sample("w", self.forcing_prior(rows))
-            goal = pyro.sample("goal", unit.expand([rows, latent]).to_event(1))
-            start = None
-            if self.goal_scaling:
-                start = pyro.sample("start", unit.expand([rows, latent]).to_event(1))
+            plan = self.plan(rows)
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
             z = pyro.sample("z", unit.expand([windows, time, latent]).to_event(2))
             velocity = pyro.sample("velocity", unit.expand([windows, latent]).to_event(1))
             ε = pyro.sample("epsilon", unit.expand([windows, time - 1, latent]).to_event(2))
-            path = self.path(z[:, 0], velocity, w, goal, ε, batch, start)
+            path = self.path(z[:, 0], velocity, plan, ε, batch)
             if self.config.flatness:
                 pyro.factor("flatness", self.flatness_prior(path))
             mean = self.decoder(torch.stack([path, self.embed(z)]))
@@ -86,6 +83,16 @@ class VaeDmp(LatentDmp):
                 if batch.mask is not None:
                     x = x.mask(batch.mask)
                 pyro.sample(name, x.to_event(2), obs=batch.values)
+
+    def plan(self, rows: int) -> Plan:
+        """The sites of ``rows`` movements."""
+        zero = self.basis.new_zeros(rows, self.latent_dim)
+        unit = dist.Normal(zero, 1.0, validate_args=False).to_event(1)
+        return Plan(
+            w=pyro.sample("w", self.forcing_prior(rows)),
+            goal=pyro.sample("goal", unit),
+            start=pyro.sample("start", unit) if self.goal_scaling else None,
+        )
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Paths z* with the recognised noise."""
@@ -146,10 +153,7 @@ class VaeDmp(LatentDmp):
         found = self._latents(posterior.draw(batch, PRIOR_DRAWS))
         parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
         self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
-        q = posterior.encode(batch.values, batch.mask)
-        frames, seen = self.embed(q.mean), _frames_seen(batch)
-        noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames)[:, seen].flatten(0, 1)
-        self.prior_observation = (noise.T @ noise / len(noise)).detach()
+        frames, seen = self._observe(batch, posterior), self._frames_seen(batch)
         self.prior_residuals = torch.zeros_like(frames)
         self.prior_shape = frames.new_empty(0)
         rolled = self._prior(self.frames).paths.to(frames)
@@ -159,23 +163,36 @@ class VaeDmp(LatentDmp):
         )
         self.prior_shape = frames.new_tensor(tuned.shape)
 
+    def _observe(self, batch: Batch, posterior: Posterior) -> Float[Tensor, "sequence time latent"]:
+        """Encoded frames; how uncertain they are is kept."""
+        q = posterior.encode(batch.values, batch.mask)
+        frames, seen = self.embed(q.mean), self._frames_seen(batch)
+        noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames)[:, seen].flatten(0, 1)
+        self.prior_observation = (noise.T @ noise / len(noise)).detach()
+        return frames
+
     def _readout(self, frames: Float[Tensor, "sequence time latent"]) -> Readout:
         jacobian = torch.func.vmap(torch.func.jacfwd(self.decoder))(frames.flatten(0, 1))
         shape = (*frames.shape[:2], *jacobian.shape[1:])
         return Readout(jacobian.detach().double().view(shape), self.output_std.detach().double())
 
-    def _latents(self, drawn: dict[str, Tensor]) -> _Latents:
+    def _frames_seen(self, batch: Batch) -> Bool[Tensor, "sequence time"]:
+        if batch.mask is None:
+            return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=self.basis.device)
+        return batch.mask.all(-1)
+
+    def _latents(self, drawn: dict[str, Tensor]) -> Latents:
         start = self.embed(drawn["start"]) if self.goal_scaling else None
         goal = self.embed(drawn["goal"])
-        return _Latents(
+        return Latents(
             w=self.scaled(drawn["w"], goal, start),
-            unscaled=drawn["w"] if self.goal_scaling else None,
+            plan=Plan.of(drawn),
             goal=goal,
             position=self.embed(drawn["z"][:, :, 0]),
             velocity=self.config.velocity_scale * drawn["velocity"],
         )
 
-    def _pull(self, found: _Latents, duration: float) -> Float[Tensor, "sample sequence step d"]:
+    def _pull(self, found: Latents, duration: float) -> Float[Tensor, "sample sequence step d"]:
         """z^goal + σ_w Ψ w at every step: the forces in units of αβ."""
         steps = round((self.frames - 1) * duration)
         basis = self.config.w_scale * self.kernels_at(steps, duration).to(found.w)
@@ -187,10 +204,10 @@ class VaeDmp(LatentDmp):
         known = laplace(lambda z: self.decoder(self.embed(z)), start, x, self.output_std)
         return self.embed(known.sample((draws,)))
 
-    def _aimed(self, found: _Latents, goal: Float[Tensor, "sample sequence d"]) -> _Latents:
+    def _aimed(self, found: Latents, goal: Float[Tensor, "sample sequence d"]) -> Latents:
         """Another goal, the forcing term multiplied by (g − y_0)/(g_fit − y_0), §6.2.5."""
-        if found.unscaled is not None:
-            return replace(found, w=self.scaled(found.unscaled, goal, found.position), goal=goal)
+        if self.goal_scaling:
+            return replace(found, w=self.scaled(found.plan.w, goal, found.position), goal=goal)
         old, new = found.goal - found.position, goal - found.position
         ratio = (new * old + GOAL_SLACK) / (old.square() + GOAL_SLACK)
         return replace(found, w=found.w * ratio.unsqueeze(2), goal=goal)
@@ -198,8 +215,7 @@ class VaeDmp(LatentDmp):
     def _paths(self, drawn: dict[str, Tensor], batch: Batch, draws: int) -> Tensor:
         flat = {name: value.flatten(0, 1) for name, value in drawn.items()}
         first, velocity, ε = flat["z"][:, 0], flat["velocity"], flat["epsilon"]
-        every, start = batch.repeat(draws), flat.get("start")
-        path = self.path(first, velocity, flat["w"], flat["goal"], ε, every, start)
+        path = self.path(first, velocity, Plan.of(flat), ε, batch.repeat(draws))
         split: Tensor = path.unflatten(0, (draws, len(batch)))
         return split
 
@@ -254,33 +270,31 @@ class VaeDmp(LatentDmp):
     def _encoded(
         self, values: Tensor, mask: Tensor, y: Tensor, posterior: Posterior
     ) -> tuple[Float[Tensor, "sequence time d"], Float[Tensor, "sequence time d d"]]:
-        """Latent frames and how uncertain missing entries make them (Rezende et al. 2014)."""
+        """Latent frames and how uncertain missing entries make them, by the decoder alone."""
         extra = torch.diag_embed(UNSEEN * (~mask.any(-1, keepdim=True)).to(y).expand_as(y))
         part = mask.any(-1) & ~mask.all(-1)
         if not part.any():
             return y, extra
-        z = conditional_draws(
-            lambda z: (self.decoder(self.embed(z)), self.output_std),
-            posterior.encode,
+        known = laplace(
+            lambda z: self.decoder(self.embed(z)),
+            posterior.encode(values, mask).mean[part],
             values[part],
-            mask[part],
-            self.latent_dim,
-            draws=KEPT,
-            chains=CHAINS,
-            burn_in=BURN_IN,
+            torch.where(mask[part], self.output_std, torch.inf),
+            restarts=RESTARTS,
+            near=False,
         )
-        moved = self.embed(z)
+        moved = self.embed(known.sample((KEPT,)))
         apart = moved - moved.mean(0)
         extra[part] = torch.einsum("sid,sie->ide", apart, apart) / (KEPT - 1)
         return y.masked_scatter(part[..., None], moved.mean(0)), extra
 
 
 @dataclass(frozen=True)
-class _Latents:
-    """What belongs to movements; ``unscaled`` is w before it is multiplied by goal − start."""
+class Latents:
+    """What belongs to movements, in the space of z*; w is scaled by goal − start, if at all."""
 
+    plan: Plan
     w: Float[Tensor, "sample sequence kernel latent"]
-    unscaled: Float[Tensor, "sample sequence kernel latent"] | None
     goal: Float[Tensor, "sample sequence latent"]
     position: Float[Tensor, "sample sequence latent"]
     velocity: Float[Tensor, "sample sequence latent"]
@@ -296,12 +310,6 @@ def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row la
 def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
     """Whether only whole frames are missing, the same of every movement."""
     return bool((mask == mask[:1, :, :1]).all())
-
-
-def _frames_seen(batch: Batch) -> Tensor:
-    if batch.mask is None:
-        return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=batch.values.device)
-    return batch.mask.all(-1)
 
 
 def _need(posterior: Posterior | None) -> Posterior:
