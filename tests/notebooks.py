@@ -11,7 +11,7 @@ import jupytext
 import nbformat
 
 HOME = Path(__file__).resolve().parent.parent / "notebooks"
-EXPECTED = 3
+EXPECTED = 5
 
 
 def main() -> int:

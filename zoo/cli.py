@@ -194,9 +194,9 @@ def play_command(
     movement: Annotated[int, typer.Option(help="Which movement, from 0.")] = 0,
     seen: Annotated[int | None, typer.Option(help="Frames shown to the forecast.")] = None,
     horizon: Annotated[int | None, typer.Option(help="Frames to forecast.")] = None,
-    onto: Annotated[int | None, typer.Option(help="Switch to this movement.")] = None,
-    start: Annotated[int, typer.Option(help="Frame where the switch begins.")] = 20,
-    steps: Annotated[int, typer.Option(help="Frames that the switch takes.")] = 18,
+    onto: Annotated[int | None, typer.Option(help="Switch to this movement, from 0.")] = None,
+    start: Annotated[int, typer.Option(help="With --onto: frame where it begins.")] = 20,
+    steps: Annotated[int, typer.Option(help="With --onto: frames it takes.")] = 18,
 ) -> None:
     """Play a movement in a page: data, reconstruction, forecast with its spread, and a switch."""
     from zoo.screening import screen
@@ -213,7 +213,8 @@ def play_command(
     )
     player.save(output)
     names = ", ".join(track.name for track in player.tracks)
-    print(f"{output}: {names}; {player.frames} frames. Open it in any browser.")
+    print(f"{player.title}: {names}; {player.frames} frames")
+    print(f"Page written to {output}; open it in any browser")
 
 
 @app.command()

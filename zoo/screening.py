@@ -8,7 +8,7 @@ from pathlib import Path
 from zoo import archive
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import NotCapableError
+from zoo.errors import NotCapableError, UnknownNameError
 from zoo.player import Player, play
 from zoo.run import Run
 from zoo.tasks import Setup, beginning
@@ -30,7 +30,8 @@ def screen(
 ) -> Player:
     """A player of a data set by name, or of a run by its folder, on its test part or ``data``."""
     if not archive.exists(Path(source), "run"):
-        found = _movements(load_data(source if data is None else data))
+        asked = {"seen": seen, "horizon": horizon, "onto": onto, "data": data}
+        found = _recorded(source, [k for k, v in asked.items() if v is not None])
         _check(item, found)
         return play(found, names=["data"], item=item, title=_title(found, item))
     run, unseen = open_run(Path(source), data)
@@ -83,10 +84,24 @@ def screen_run(
             play(data[onto : onto + 1], names=["switched to"]),
             play(switched, names=["switch"]),
         ]
-        marks += [(start, "switch"), (start + steps, "switched")]
+        marks += [(start, "switch begins"), (start + steps, "switch ends")]
     tracks = tuple(track for player in shown for track in player.tracks)
     title = f"{run.name}: {_title(data, item)}"
     return replace(shown[0], tracks=tracks, title=title, marks=tuple(marks), rate=data.rate)
+
+
+def _recorded(source: str, asked: list[str]) -> Sequences:
+    """The data set of that name, of which nothing can be asked that needs a model."""
+    try:
+        found = _movements(load_data(source))
+    except UnknownNameError as error:
+        raise UnknownNameError(f"{source} is no folder with a run, and {error}") from None
+    if asked:
+        raise ValueError(
+            f"{asked[0]} needs a trained model, and {source} is a data set: "
+            "zoo fit MODEL --run-dir FOLDER, then zoo play FOLDER"
+        )
+    return found
 
 
 def _movements(data: Sequences | Pairs) -> Sequences:
@@ -101,5 +116,10 @@ def _check(item: int, data: Sequences) -> None:
 
 
 def _title(data: Sequences, item: int) -> str:
-    said = ", ".join(f"{k} {v[item]}" for k, v in data.groups.items())
+    said = ", ".join(_said(k, v[item]) for k, v in data.groups.items())
     return f"{data.name}, movement {item} ({said})" if said else f"{data.name}, movement {item}"
+
+
+def _said(column: str, value: object) -> str:
+    """``subject 35``, but ``trial_004`` where the value says its column."""
+    return str(value) if str(value).startswith(column) else f"{column} {value}"

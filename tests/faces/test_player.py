@@ -20,7 +20,17 @@ import zoo
 from zoo.cli import main
 from zoo.datasets.robot_arm import end_effector
 from zoo.datasets.skeleton import Bone, Skeleton
-from zoo.player import Arm, Human, Player, Track, body_for, play, posture_map, posture_strip
+from zoo.player import (
+    Arm,
+    Human,
+    Player,
+    Track,
+    body_for,
+    play,
+    posture_map,
+    posture_strip,
+    posture_strips,
+)
 from zoo.screening import screen_run
 
 BROWSER = shutil.which("chromium")
@@ -76,7 +86,7 @@ def test_a_run_is_screened_with_its_spread_and_its_switch(run: zoo.Run, arm: zoo
     assert len(tracks["forecast"]["draws"]) == 12
     assert tracks["data"]["draws"] == []
     assert [10, "forecast begins"] in data["marks"]
-    assert [38, "switched"] in data["marks"]
+    assert [38, "switch ends"] in data["marks"]
 
 
 def test_the_page_asks_nothing_of_the_network_and_cannot_be_broken_out_of(
@@ -109,8 +119,9 @@ def test_mistakes_are_named(arm: zoo.Sequences, monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(ValueError, match="not finite"):
         Player(body=Arm(), tracks=(holed,)).page()
     monkeypatch.setattr("zoo.player.bodies.load_skeleton", lambda subject: BODY.skeleton)
-    with pytest.raises(ValueError, match="'elbow' moves no body"):
-        body_for(["elbow"])
+    for foreign in ("angle", "elbow_rx"):
+        with pytest.raises(ValueError, match=f"'{foreign}' moves no body"):
+            body_for(["lleg_rx", foreign])
 
 
 def test_limbs_have_sides() -> None:
@@ -121,15 +132,24 @@ def test_limbs_have_sides() -> None:
 
 
 def test_postures_are_drawn_where_they_belong() -> None:
-    """As many bodies as frames and points; a map keeps every body in its own cell."""
+    """As many bodies as frames and points, rows to one scale; a map keeps each in its cell."""
     from matplotlib.figure import Figure
 
     strip, plane = Figure().subplots(2)
     names = ["lleg_rx", "rleg_rx"]
     posture_strip(strip, torch.randn(13, 2), names, body=BODY, every=6)
     assert len(strip.lines) == 3 * 2
+    one, other = Figure().subplots(2)
+    posture_strips(
+        [one, other], {"a": torch.zeros(13, 2), "b": torch.randn(13, 2)}, names, body=BODY
+    )
+    assert one.get_xlim() == other.get_xlim()
+    assert one.get_ylim() == other.get_ylim()
+    assert (one.get_xticks() == other.get_xticks()).all()
+    assert [one.get_title("left"), other.get_title("left")] == ["a", "b"]
     posture_map(plane, torch.randn(2, 3, 2), names, [0.0, 1.0, 2.0], [0.0, 5.0], body=BODY)
     assert len(plane.lines) == 2 * 3 * 2
+    assert plane.get_aspect() == 1 / 5  # cells are square on paper, so that bodies keep their shape
     for k, line in enumerate(plane.lines):
         column, row = (k // 2) % 3, (k // 2) // 3
         assert abs(line.get_xdata() - column).max() < 0.5
@@ -147,8 +167,15 @@ def test_the_command_writes_a_page(
     command = ["play", str(folder), "--data", "robot-arm", "--onto", "2", "--output", str(page)]
     assert main(command) == 0
     assert "switch" in capsys.readouterr().out
-    assert main(["play", "robot-arm", "--movement", "9", "--output", str(page)]) == 2
-    assert "between 0 and 4" in capsys.readouterr().err
+    refused = {
+        "robot-arm --movement 9": "between 0 and 4",
+        "robot-arm --onto 2": "onto needs a trained model, and robot-arm is a data set",
+        "runs/none": "runs/none is no folder with a run, and no data set",
+        "pendulum": "moves no body known here",
+    }
+    for words, reason in refused.items():
+        assert main(["play", *words.split(), "--output", str(page)]) == 2
+        assert reason in capsys.readouterr().err
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no chromium to open the page with")

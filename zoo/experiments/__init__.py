@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from zoo.experiments.result import EXPERIMENTS, Experiment, Result, run_experiment
+from zoo.experiments.stored import Stored, stored
 
-__all__ = ["EXPERIMENTS", "Experiment", "Result", "run_experiment"]
+__all__ = ["EXPERIMENTS", "Experiment", "Result", "Stored", "run_experiment", "stored"]

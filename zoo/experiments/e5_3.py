@@ -12,7 +12,7 @@ from torch import Tensor
 from zoo.datasets.records import Sequences
 from zoo.experiments.chapter5 import both, fitted
 from zoo.experiments.result import Result
-from zoo.player import posture_strip
+from zoo.player import posture_strips
 from zoo.prediction import Predictive
 from zoo.run import Run
 
@@ -150,7 +150,7 @@ def _figure(
 ) -> Figure:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(14, 8), layout="constrained")
+    figure = Figure(figsize=(14, 9), layout="constrained")
     units = latent.shape[-1]
     spec = figure.add_gridspec(4, units, height_ratios=(1.2, 1, 1, 1))
     limit = float(latent.abs().max()) * 1.05
@@ -170,8 +170,5 @@ def _figure(
         "walking": plain["walking"][0],
         f"walking with unit {best + 1} as in jogging": slow[0],
     }
-    for row, (name, angles) in enumerate(strips.items()):
-        axes = figure.add_subplot(spec[row + 1, :])
-        posture_strip(axes, angles, data.channels)
-        axes.set_title(name, fontsize=10, loc="left")
+    posture_strips([figure.add_subplot(spec[k, :]) for k in (1, 2, 3)], strips, data.channels)
     return figure

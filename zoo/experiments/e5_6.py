@@ -14,7 +14,7 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments import e5_1
 from zoo.experiments.result import Result
-from zoo.player import posture_strip
+from zoo.player import posture_strips
 from zoo.prediction import Prediction
 from zoo.run import Run, create, fit
 
@@ -120,10 +120,10 @@ def _figure(
     spec = figure.add_gridspec(4, 2, height_ratios=(2.2, 1, 1, 1))
     _plane(figure.add_subplot(spec[0, 0]), run, punch, goals, found["ae-dmp"])
     _joint(figure.add_subplot(spec[0, 1]), punch, found["vae-dmp-single"])
-    for row, k in enumerate((0, 2, 4)):
-        axes = figure.add_subplot(spec[row + 1, :])
-        posture_strip(axes, found["ae-dmp"][k].mean[0], punch.channels)
-        axes.set_title(f"ae-dmp, goal at {SHARES[k]:.0%} of the way", fontsize=10, loc="left")
+    strips = {
+        f"ae-dmp, goal at {SHARES[k]:.0%} of the way": found["ae-dmp"][k].mean[0] for k in (0, 2, 4)
+    }
+    posture_strips([figure.add_subplot(spec[k, :]) for k in (1, 2, 3)], strips, punch.channels)
     return figure
 
 

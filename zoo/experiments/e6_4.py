@@ -11,7 +11,7 @@ from torch import Tensor
 from zoo.datasets.records import Sequences
 from zoo.experiments.chapter5 import FRAMES, both, fitted
 from zoo.experiments.result import Result
-from zoo.player import posture_strip
+from zoo.player import posture_strips
 from zoo.prediction import Prediction
 from zoo.run import Run
 
@@ -118,11 +118,9 @@ def _figure(
     latent, joint = figure.add_subplot(spec[0, 0]), figure.add_subplot(spec[0, 1])
     _latent(latent, model, jog, walk)
     _joint(joint, switch, alone, target, jog.channels.index(JOINT))
-    strips = {"jogging": alone, "switched": switch, "walking": target}
-    for k, (name, prediction) in enumerate(strips.items()):
-        axes = figure.add_subplot(spec[k + 1, :])
-        posture_strip(axes, prediction.mean[0], jog.channels)
-        axes.set_title(name, fontsize=10, loc="left")
+    shown = {"jogging": alone, "switched": switch, "walking": target}
+    strips = {name: prediction.mean[0] for name, prediction in shown.items()}
+    posture_strips([figure.add_subplot(spec[k, :]) for k in (1, 2, 3)], strips, jog.channels)
     return figure
 
 

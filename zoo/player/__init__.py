@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from zoo.player.bodies import Arm, Body, Human, body_for
 from zoo.player.page import Player, Track, play
-from zoo.player.postures import posture_map, posture_strip
+from zoo.player.postures import posture_map, posture_strip, posture_strips
 
 __all__ = [
     "Arm",
@@ -16,4 +16,5 @@ __all__ = [
     "play",
     "posture_map",
     "posture_strip",
+    "posture_strips",
 ]

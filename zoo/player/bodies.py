@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,6 +17,7 @@ from zoo.datasets.skeleton import Skeleton
 
 __all__ = ["Arm", "Body", "Human", "body_for"]
 
+ANGLE = re.compile(r"[a-z]+_[rt][xyz]")
 ARM_CHANNELS = tuple(f"joint_{i}" for i in range(1, 7))
 
 
@@ -101,11 +103,15 @@ def body_for(names: Sequence[str], body: Body | None = None) -> Body:
         return body
     if tuple(names) == ARM_CHANNELS:
         return Arm()
+    _check([name for name in names if not ANGLE.fullmatch(name)])
     human = Human(load_skeleton(35))
-    foreign = [name for name in names if name not in human.skeleton.channels]
+    _check([name for name in names if name not in human.skeleton.channels])
+    return human
+
+
+def _check(foreign: Sequence[str]) -> None:
     if foreign:
         raise ValueError(
             f"channel {foreign[0]!r} moves no body known here; give body=, such as "
             "Human(skeleton) with the skeleton of these data"
         )
-    return human
