@@ -105,7 +105,8 @@ class PathPrior:
         return Conditioned(
             means=(means + white @ half).unflatten(-1, (time, latent)),
             log_weights=torch.log_softmax(-0.5 * white.square().sum(-1), dim=-1),
-            covariance=full - half.mT @ half,
+            prior=full,
+            known=half,
         )
 
     def tuned(self, seen: Sequence[int], readout: Readout) -> Self:
@@ -164,11 +165,31 @@ class Readout:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A mixture over paths after frames were seen; all components share the covariance."""
+    """A mixture over paths after frames were seen; all components share the covariance.
+
+    That is the ``prior``'s less what is ``known``, knownᵀ known.
+    """
 
     means: Float[Tensor, "*batch component time latent"]
     log_weights: Float[Tensor, "*batch component"]
-    covariance: Float[Tensor, "*batch path path"]
+    prior: Float[Tensor, "path path"]
+    known: Float[Tensor, "*batch seen path"]
+
+    @property
+    def covariance(self) -> Float[Tensor, "*batch path path"]:
+        """Covariance of whole paths."""
+        covariance: Tensor = self.prior - self.known.mT @ self.known
+        return covariance
+
+    @property
+    def frame_covariances(self) -> Float[Tensor, "time latent latent"]:
+        """Covariance of every frame, of a single sequence."""
+        time, latent = self.means.shape[-2:]
+        blocks = self.prior.unflatten(-1, (time, latent)).unflatten(-3, (time, latent))
+        told = self.known.unflatten(-1, (time, latent))
+        own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+        left: Tensor = own - torch.einsum("rti,rtj->tij", told, told)
+        return left
 
     def sample(self, draws: int) -> Float[Tensor, "sample *batch time latent"]:
         """Joint draws of whole paths."""
@@ -177,7 +198,7 @@ class Conditioned:
         means = self.means.expand(draws, *self.means.shape)
         index = picks[..., None, None, None].expand(*picks.shape, 1, time, latent)
         centre = means.gather(-3, index).squeeze(-3)
-        white = torch.randn(*picks.shape, time * latent, dtype=self.covariance.dtype)
+        white = torch.randn(*picks.shape, time * latent, dtype=self.prior.dtype)
         moved = white.movedim(0, -2) @ cholesky(self.covariance).mT
         path: Tensor = centre + moved.movedim(-2, 0).unflatten(-1, (time, latent))
         return path
@@ -186,9 +207,7 @@ class Conditioned:
         self, path: Float[Tensor, "time latent"], readout: Readout
     ) -> Float[Tensor, "time channel"]:
         """Log marginal density of every channel of every frame, read out along a path."""
-        time, latent = path.shape
-        blocks = self.covariance.unflatten(-1, (time, latent)).unflatten(-3, (time, latent))
-        J, each = readout.jacobian, blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+        J, each = readout.jacobian, self.frame_covariances
         variance = torch.einsum("tci,tij,tcj->tc", J, each, J) + readout.std.square()
         apart = torch.einsum("tci,mti->mtc", J, self.means - path)
         normal = torch.distributions.Normal(torch.zeros_like(apart), variance.sqrt())

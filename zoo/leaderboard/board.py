@@ -135,7 +135,7 @@ def _result(
             "± 95 %",
             "p against the best",
             f"p against {REFERENCE}",
-            "seconds",
+            "seconds of training",
         ),
         rows=tuple(rows),
         findings=(

@@ -1,11 +1,10 @@
-"""One cell of a leaderboard: a model trained without a fold, and its prediction of that fold."""
+"""One cell of a leaderboard: models trained without a fold, and their prediction of that fold."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -22,7 +21,7 @@ from zoo.ensemble import Ensemble
 from zoo.errors import DamagedRunError
 from zoo.leaderboard.protocols import PROTOCOLS, Protocol
 from zoo.prediction import Prediction, Predictive
-from zoo.run import create, fit
+from zoo.run import Resume, Run, create, fit, load
 from zoo.strategies import Svi
 
 __all__ = ["Cell", "Found", "compute", "compute_all"]
@@ -47,19 +46,33 @@ class Cell:
     rows: tuple[int, ...]
 
     @property
+    def members(self) -> tuple[tuple[str, dict[str, Any]], ...]:
+        """Entries and their settings."""
+        pairs = zip(self.model.split("+"), self.settings, strict=True)
+        return tuple((name, dict(settings)) for name, settings in pairs)
+
+    @property
     def key(self) -> str:
         """A hash of everything that the answer depends on."""
-        told = [self.protocol, self.model, self.settings, self.seed, self.rows, zoo.__version__]
-        return hashlib.blake2b(json.dumps(told).encode(), digest_size=8).hexdigest()
+        return _hash(self.protocol, self.model, self.settings, self.seed, self.rows)
 
     def folder(self, root: Path) -> Path:
         """Where its answer is kept."""
         return root / self.protocol / self.model / f"seed-{self.seed}-{self.key}"
 
+    def training(self, root: Path, data: str, member: int) -> Path:
+        """Where a member is trained, for all protocols on these data and all ensembles."""
+        name, settings = self.members[member]
+        key = _hash(data, name, sorted(settings.items()), self.seed, self.rows)
+        return root / "trained" / f"{name}-{key}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """The answer of a cell: a prediction of its rows, or the error that stopped it."""
+    """The answer of a cell: a prediction of its rows, or the error that stopped it.
+
+    ``seconds`` are those of its trainings.
+    """
 
     cell: Cell
     prediction: Prediction | None
@@ -74,13 +87,12 @@ def compute(cell: Cell, root: Path, protocol: Protocol | None = None) -> Found:
     if kept is not None:
         return kept
     asked = PROTOCOLS[cell.protocol] if protocol is None else protocol
-    data, began = asked.load(), time.monotonic()
     try:
-        prediction: Prediction | None = _predicted(cell, asked, data, folder)
-        error = ""
+        prediction, seconds = _predicted(cell, asked, asked.load(), root)
+        found = Found(cell=cell, prediction=prediction, error="", seconds=seconds)
     except (RuntimeError, TypeError, ValueError) as stop:
-        prediction, error = None, f"{type(stop).__name__}: {stop}"
-    found = Found(cell=cell, prediction=prediction, error=error, seconds=time.monotonic() - began)
+        error = f"{type(stop).__name__}: {stop}"
+        found = Found(cell=cell, prediction=None, error=error, seconds=0.0)
     _keep(found, folder)
     return found
 
@@ -88,42 +100,62 @@ def compute(cell: Cell, root: Path, protocol: Protocol | None = None) -> Found:
 def compute_all(
     cells: Sequence[Cell], root: Path, jobs: int, note: Callable[[Found], None]
 ) -> list[Found]:
-    """All answers, in processes of one thread each."""
-    if jobs == 1:
-        found = []
-        for cell in cells:
-            found.append(compute(cell, root))
-            note(found[-1])
-        return found
+    """All answers, in processes of one thread each; ensembles last, of what was trained by then."""
     done: dict[Cell, Found] = {}
+    alone = [cell for cell in cells if len(cell.members) == 1]
+    together = [cell for cell in cells if len(cell.members) > 1]
+    for stage in (alone, together):
+        for answer in _computed(stage, root, jobs):
+            done[answer.cell] = answer
+            note(answer)
+    return [done[cell] for cell in cells]
+
+
+def _computed(cells: Sequence[Cell], root: Path, jobs: int) -> Iterator[Found]:
+    """Answers as they are found."""
+    if jobs == 1:
+        yield from (compute(cell, root) for cell in cells)
+        return
     with ProcessPoolExecutor(jobs, get_context("spawn"), _one_thread) as pool:
         futures = [pool.submit(compute, cell, root) for cell in cells]
         try:
             for future in as_completed(futures):
-                answer = future.result()
-                done[answer.cell] = answer
-                note(answer)
+                yield future.result()
         except KeyboardInterrupt:
             pool.shutdown(cancel_futures=True)
             raise
-    return [done[cell] for cell in cells]
 
 
 def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _predicted(cell: Cell, protocol: Protocol, data: Sequences, folder: Path) -> Prediction:
+def _predicted(
+    cell: Cell, protocol: Protocol, data: Sequences, root: Path
+) -> tuple[Prediction, float]:
+    """The answer, and the seconds that its members took to train."""
     inside = set(cell.rows)
     train = data[[i for i in range(len(data)) if i not in inside]]
-    members = []
-    for name, settings in zip(cell.model.split("+"), cell.settings, strict=True):
-        assembly = create(name, train, seed=cell.seed, **dict(settings))
-        trained = isinstance(assembly.inference, Svi)
-        where = folder / f"run-{name}" if trained else None
-        members.append(fit(assembly, train, run_dir=where, resume="auto" if trained else "never"))
+    members = [_trained(cell, protocol, train, root, k) for k in range(len(cell.members))]
     run = members[0] if len(members) == 1 else Ensemble(members=tuple(members))
-    return protocol.answer(run, data[list(cell.rows)], draws=DRAWS, seed=cell.seed)
+    answer = protocol.answer(run, data[list(cell.rows)], draws=DRAWS, seed=cell.seed)
+    return answer, sum(member.seconds for member in members)
+
+
+def _trained(cell: Cell, protocol: Protocol, train: Sequences, root: Path, member: int) -> Run:
+    """A member trained before, or now; an interrupted training goes on."""
+    name, settings = cell.members[member]
+    folder = cell.training(root, protocol.data or cell.protocol, member)
+    if archive.exists(folder, "run"):
+        return load(folder)
+    assembly = create(name, train, seed=cell.seed, **settings)
+    resume: Resume = "auto" if isinstance(assembly.inference, Svi) else "never"
+    return fit(assembly, train, run_dir=folder, resume=resume)
+
+
+def _hash(*told: Any) -> str:
+    text = json.dumps([*told, zoo.__version__])
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _keep(found: Found, folder: Path) -> None:

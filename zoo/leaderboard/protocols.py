@@ -30,7 +30,8 @@ class Protocol:
     """One question: ``seen`` frames and the rest to forecast, or ``hidden`` channels to fill in.
 
     ``settings`` are what an entry is given here instead of its defaults; ``models`` are asked
-    where none are named. Groups of ``by`` are never in training and test at once.
+    where none are named. Groups of ``by`` are never in training and test at once. Protocols whose
+    ``data`` have one name share what was trained on them.
     """
 
     summary: str
@@ -38,6 +39,7 @@ class Protocol:
     source: Literal["public", "simulated"]
     need: Need
     models: tuple[str, ...]
+    data: str = ""
     seen: int = 0
     hidden: tuple[str, ...] = ()
     by: str = "trial"
@@ -88,11 +90,46 @@ def _slow_walks() -> Sequences:
     return load("35-walk", frames=None, rate=30.0).frames(0, FRAMES // 4)
 
 
-_FORECASTERS = (*BASELINES, "dmp", "promp", "promp-rhythmic", "kernel-ridge+promp-rhythmic")
-_IMPUTERS = ("mean", "ar", "nearest-neighbour", "kernel-ridge")
+_FORECASTERS = (
+    *BASELINES,
+    "dmp",
+    "dmp-rhythmic",
+    "promp",
+    "promp-rhythmic",
+    "pca-dmp",
+    "ae-dmp",
+    "sparse-ae-dmp",
+    "ae-then-dmp",
+    "vae-dmp",
+    "vae-dmp-rhythmic",
+    "dvbf",
+    "promp-rhythmic+vae-dmp-rhythmic",
+)
+_IMPUTERS = (
+    "mean",
+    "ar",
+    "nearest-neighbour",
+    "kernel-ridge",
+    "pca",
+    "dmp",
+    "promp",
+    "promp-rhythmic",
+    "ae-dmp",
+    "vae",
+    "vae-dmp",
+    "vae-dmp-rhythmic",
+    "nearest-neighbour+promp-rhythmic",
+    "nearest-neighbour+promp-rhythmic+vae-dmp-rhythmic",
+)
+_AE_DMP: Mapping[str, Any] = {"epochs": 1000}
 _WALK_SETTINGS: Settings = {
     "kernel-ridge": {"places": 200},
-    "vae-dmp": {"epochs": 100},
+    "ae-dmp": _AE_DMP,
+    "sparse-ae-dmp": _AE_DMP,
+    "ae-then-dmp": _AE_DMP,
+    "vae-dmp": {"window": 20, "stride": 5, "epochs": 200},
+    "vae-dmp-rhythmic": {"latent_dim": 8, "epochs": 200},
+    "dvbf": {"window": 60, "stride": 20, "epochs": 500},
 }
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -102,6 +139,7 @@ PROTOCOLS: dict[str, Protocol] = {
         source="public",
         need="forecast",
         models=_FORECASTERS,
+        data="centred-walks",
         seen=3,
         settings=_WALK_SETTINGS,
     ),
@@ -111,6 +149,7 @@ PROTOCOLS: dict[str, Protocol] = {
         source="public",
         need="forecast",
         models=_FORECASTERS,
+        data="centred-walks",
         seen=100,
         settings=_WALK_SETTINGS,
     ),
@@ -119,11 +158,14 @@ PROTOCOLS: dict[str, Protocol] = {
         load=_slow_walks,
         source="public",
         need="impute",
-        models=(*_IMPUTERS, "pca", "promp", "promp-rhythmic", "nearest-neighbour+promp-rhythmic"),
+        models=_IMPUTERS,
         hidden=LEG,
         settings={
             "pca": {"latent_dim": 12},
-            "promp-rhythmic": {"synergies": None},
+            "vae": {"latent_dim": 12},
+            "ae-dmp": {"latent_dim": 12, **_AE_DMP},
+            "vae-dmp": {"latent_dim": 8, "epochs": 300},
+            "vae-dmp-rhythmic": {"latent_dim": 8, "stride": 2, "epochs": 400},
         },
     ),
     "arm-goals": Protocol(

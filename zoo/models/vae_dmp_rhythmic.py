@@ -26,7 +26,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["Config", "RhythmicVaeDmp"]
 
 GRID, COARSE = (48, 9), (16, 5)
-SETTLING = 24.0
+SETTLING = 40.0
 
 
 @dataclass(frozen=True, kw_only=True)
