@@ -13,6 +13,7 @@ from typing import Any
 
 from zoo.errors import UnknownNameError
 from zoo.experiments.result import EXPERIMENTS
+from zoo.leaderboard.protocols import PROTOCOLS
 
 __all__ = ["Stored", "stored"]
 
@@ -56,7 +57,7 @@ class Stored:
 
 
 def stored(identifier: str) -> Stored:
-    """What ``zoo experiment`` found last and this package ships.
+    """What ``zoo experiment`` or ``zoo leaderboard`` found last and this package ships.
 
     >>> stored("E5.1").payload["source"]
     'thesis'
@@ -66,8 +67,9 @@ def stored(identifier: str) -> Stored:
     """
     home = files("zoo.results")
     numbers, picture = home / f"{identifier}.json", home / f"{identifier}.png"
-    if identifier not in EXPERIMENTS or not numbers.is_file():
-        near = difflib.get_close_matches(identifier, EXPERIMENTS, n=3) or list(EXPERIMENTS)
+    known = [*EXPERIMENTS, *(f"leaderboard_{name}" for name in PROTOCOLS)]
+    if identifier not in known or not numbers.is_file():
+        near = difflib.get_close_matches(identifier, known, n=3) or list(EXPERIMENTS)
         raise UnknownNameError(f"no stored result {identifier!r}; nearest: {', '.join(near)}")
     return Stored(
         payload=json.loads(numbers.read_text(encoding="utf-8")),

@@ -93,16 +93,16 @@ def _slow_walks() -> Sequences:
 _FORECASTERS = (
     *BASELINES,
     "dmp",
-    "dmp-rhythmic",
     "promp",
     "promp-rhythmic",
     "pca-dmp",
+    "vae-dmp-rhythmic",
+    "vae-dmp",
     "ae-dmp",
+    "dvbf",
     "sparse-ae-dmp",
     "ae-then-dmp",
-    "vae-dmp",
-    "vae-dmp-rhythmic",
-    "dvbf",
+    "dmp-rhythmic",
     "promp-rhythmic+vae-dmp-rhythmic",
 )
 _IMPUTERS = (
