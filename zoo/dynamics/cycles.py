@@ -35,7 +35,7 @@ CHOICES = {
     "shrinkage": (0.01, 0.1, 0.5),
     "process": (0.1, 0.3, 1.0),
 }
-LEFT_OUT, DRAWS = 8, 64
+LEFT_OUT, DRAWS = 4, 64
 ROWS = 16
 
 
