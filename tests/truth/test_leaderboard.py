@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,6 +128,42 @@ def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
     for two, one in zip(apart, alone, strict=True):
         assert two.prediction is not None and one.prediction is not None
         assert torch.equal(two.prediction.mean, one.prediction.mean)
+
+
+ORPHANS = """
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from zoo.leaderboard.cells import _begin
+if __name__ == "__main__":
+    pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+    print(pool.submit(os.getpid).result(), flush=True)
+    pool.submit(time.sleep, 60)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="processes are looked up in /proc")
+def test_processes_end_with_the_command_that_began_them(tmp_path: Path) -> None:
+    """Killed without a word, it leaves nobody behind."""
+    script = tmp_path / "script.py"
+    script.write_text(ORPHANS)
+    command = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    assert command.stdout is not None
+    with command, command.stdout:
+        worker = int(command.stdout.readline())
+        command.kill()
+        command.wait()
+        deadline = time.monotonic() + 20
+        while alive(worker) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert not alive(worker)
+
+
+def alive(process: int) -> bool:
+    """Whether a process runs; one that only waits to be reaped does not."""
+    status = Path(f"/proc/{process}/stat")
+    return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_an_entry_that_fails_is_a_line_and_not_the_end(

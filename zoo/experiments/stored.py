@@ -12,8 +12,6 @@ from importlib.resources import files
 from typing import Any
 
 from zoo.errors import UnknownNameError
-from zoo.experiments.result import EXPERIMENTS
-from zoo.leaderboard.protocols import PROTOCOLS
 
 __all__ = ["Stored", "stored"]
 
@@ -67,9 +65,10 @@ def stored(identifier: str) -> Stored:
     """
     home = files("zoo.results")
     numbers, picture = home / f"{identifier}.json", home / f"{identifier}.png"
-    known = [*EXPERIMENTS, *(f"leaderboard_{name}" for name in PROTOCOLS)]
-    if identifier not in known or not numbers.is_file():
-        near = difflib.get_close_matches(identifier, known, n=3) or list(EXPERIMENTS)
+    files_there = (f.name for f in home.iterdir() if f.name.startswith(("E", "leaderboard_")))
+    known = sorted(name.removesuffix(".json") for name in files_there if name.endswith(".json"))
+    if identifier not in known:
+        near = difflib.get_close_matches(identifier, known, n=3) or known
         raise UnknownNameError(f"no stored result {identifier!r}; nearest: {', '.join(near)}")
     return Stored(
         payload=json.loads(numbers.read_text(encoding="utf-8")),

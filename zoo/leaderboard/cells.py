@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +118,7 @@ def _computed(cells: Sequence[Cell], root: Path, jobs: int) -> Iterator[Found]:
     if jobs == 1:
         yield from (compute(cell, root) for cell in cells)
         return
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _one_thread) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _begin) as pool:
         futures = [pool.submit(compute, cell, root) for cell in cells]
         try:
             for future in as_completed(futures):
@@ -126,8 +128,17 @@ def _computed(cells: Sequence[Cell], root: Path, jobs: int) -> Iterator[Found]:
             raise
 
 
-def _one_thread() -> None:
+def _begin() -> None:
+    """One thread a process, and no process that outlives the command."""
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _predicted(
