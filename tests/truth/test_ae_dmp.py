@@ -15,6 +15,7 @@ from zoo.dynamics.imitator import Imitator
 from zoo.dynamics.population import Population
 from zoo.guides import point
 from zoo.inference.loader import whole
+from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
 from zoo.models import ae_dmp, dmp, pca, pca_dmp
 from zoo.strategies import Svi
@@ -139,6 +140,50 @@ def test_pretraining_is_the_autoencoder_alone_and_then_both_are_joined() -> None
     fit_svi(model, guide, data, Svi(window=None, epochs=8, batch_size=8), on_epoch=note)
     assert [joined for joined, _ in stages] == [False] * 4 + [True] * 4
     assert [p for _, p in stages] == [0.2] * 2 + [0.0] * 6
+
+
+def test_dropped_runs_have_their_length_and_every_entry_its_probability() -> None:
+    torch.manual_seed(0)
+    n, p, together = 20_000, 0.2, 4
+    kept = point.RunDropout(p, together)(torch.ones(n, 10)) * (1 - p)
+    assert set(kept.unique().tolist()) == {0.0, 1.0}
+    share = (kept == 0).double().mean(0)
+    assert bool(((share - p).abs() < 6 * math.sqrt(p * (1 - p) / n)).all())
+    inner = kept[:, 3:7]
+    alone = (inner[:, 1:-1] == 0) & (inner[:, :-2] > 0) & (inner[:, 2:] > 0)
+    assert not bool(alone.any())
+    whole_run = float((inner == 0).all(1).double().mean())
+    assert whole_run > 1 - (1 - p) ** (1 / together) > p**together
+
+
+def test_runs_of_one_are_the_usual_dropout_and_rest_after_the_training() -> None:
+    x, runs = torch.randn(50, 10), point.RunDropout(0.3, 3)
+    torch.manual_seed(1)
+    ours = point.RunDropout(0.3)(x)
+    torch.manual_seed(1)
+    torch.testing.assert_close(ours, torch.nn.functional.dropout(x, 0.3), rtol=0, atol=0)
+    torch.testing.assert_close(runs.eval()(x), x, rtol=0, atol=0)
+
+
+def test_missing_joints_are_the_chain_by_hand_and_the_roll_out_nearest_to_it() -> None:
+    """A movement of which all was seen beside it is encoded and decoded alone."""
+    data, chain = movements().to(dtype=torch.float32), 3
+    torch.manual_seed(0)
+    model = ae_dmp.AeDmp(data.layout, ae_dmp.Config(latent_dim=3, chain=chain))
+    guide = point.PointGuide(data.layout, model, point.Config()).eval()
+    mask = torch.ones_like(data.values, dtype=torch.bool)
+    mask[:-1, :, 1] = False
+    holed = replace(whole(data), values=data.values * mask, mask=mask)
+    with torch.no_grad():
+        x = holed.values
+        for _ in range(chain):
+            x = torch.where(mask, x, model.decoder(guide.encoder(x)))
+        path = guide.encoder(x)
+        expected = model.decoder(model.imitator.roll_out(model.imitator.fit(path)))
+        found = model.impute(holed, GuidePosterior(guide), draws=1).location[0]
+        alone = model.decoder(guide.encoder(data.values[-1]))
+    torch.testing.assert_close(found[:-1], expected[:-1])
+    torch.testing.assert_close(found[-1], alone)
 
 
 def test_the_parts_that_stay_apart_are_never_joined() -> None:

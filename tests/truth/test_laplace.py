@@ -39,3 +39,33 @@ def test_a_network_s_mode_is_that_of_a_general_optimiser() -> None:
     for row in range(3):
         other = minimize(lambda z, row=row: loss(torch.from_numpy(z), row), start[row].numpy())
         assert loss(found.mean[row], row) <= other.fun + 1e-6 * abs(other.fun)
+
+
+def test_entries_of_infinite_spread_are_not_there() -> None:
+    """A different part of every frame is missing; each has the posterior of what is left of it."""
+    torch.manual_seed(2)
+    W, x = torch.randn(6, 2, dtype=torch.float64), torch.randn(4, 6, dtype=torch.float64)
+    seen = torch.rand(4, 6) > 0.4
+    σ = torch.full((4, 6), 0.5, dtype=torch.float64).masked_fill(~seen, torch.inf)
+    begin = torch.zeros(4, 2, dtype=torch.float64)
+    found = laplace(lambda z: z @ W.T, begin, x, σ)
+    for row, kept in enumerate(seen):
+        alone = laplace(
+            lambda z, k=kept: z @ W[k].T, begin[:1], x[row : row + 1, kept], σ[row, kept]
+        )
+        torch.testing.assert_close(found.mean[row], alone.mean[0], rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(
+            found.covariance_matrix[row], alone.covariance_matrix[0], rtol=1e-8, atol=1e-8
+        )
+
+
+def test_the_best_mode_is_taken_unless_the_nearest_is_asked_for() -> None:
+    """z² = 4 has modes near −2 and 2, of which the tilt prefers the one that is farther away."""
+
+    def decode(z: torch.Tensor) -> torch.Tensor:
+        return torch.cat([z.square(), 0.1 * z], -1)
+
+    start, x = torch.full((1, 1), -1.5), torch.tensor([[4.0, 0.2]])
+    near, best = (laplace(decode, start, x, torch.full((2,), 0.1), near=n) for n in (True, False))
+    assert float(near.mean) < -1.5
+    assert float(best.mean) > 1.5

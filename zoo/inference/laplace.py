@@ -21,31 +21,37 @@ def laplace(
     decode: Callable[[Tensor], Tensor],
     start: Float[Tensor, "frame latent"],
     x: Float[Tensor, "frame channel"],
-    std: Float[Tensor, " channel"],
+    std: Float[Tensor, "#frame channel"],
     *,
     restarts: int = 16,
+    near: bool = True,
 ) -> MultivariateNormal:
     r"""p(z | x) of z ~ N(0, I), x ~ N(decode(z), diag std²), as a Gaussian at its mode.
 
-    Modes are sought by Levenberg and Marquardt's method from ``start`` and from ``restarts`` draws
-    of the prior. Of those that miss x by no more than twice what the best does, or by six standard
-    deviations, the nearest to ``start`` is taken: what a decoder maps alike is told apart by that.
-    The covariance is (I + JᵀJ/σ²)⁻¹ with the Jacobian J of ``decode`` there (Gauss–Newton). An
-    amortised encoder knows only frames like those of the training; this asks the decoder itself.
+    Entries whose ``std`` is infinite count as not seen. Modes are sought by Levenberg and
+    Marquardt's method from ``start`` and from ``restarts`` draws of the prior. Of those that miss x
+    by no more than twice what the best does, or by six standard deviations, the nearest to
+    ``start`` is taken: what a decoder maps alike is told apart by that. Without ``near`` it is the
+    best. The covariance is (I + JᵀJ/σ²)⁻¹ with the Jacobian J of ``decode`` there (Gauss and
+    Newton). An amortised encoder knows only frames like those of the training; this asks the
+    decoder itself.
 
     >>> known = laplace(lambda z: 2 * z, torch.zeros(1, 1), torch.ones(1, 1), torch.ones(1))
     >>> round(float(known.mean), 3), round(float(known.covariance_matrix), 3)
     (0.4, 0.2)
     """
     begin = torch.cat([start[None], torch.randn(restarts, *start.shape).to(start)])
-    z = _modes(decode, begin.flatten(0, 1), x.repeat(1 + restarts, 1), std)
-    losses = _loss(decode, z, x.repeat(1 + restarts, 1), std).view(1 + restarts, -1)
-    enough = (ALIKE**2 * losses.amin(0)).clamp(min=ENOUGH**2 * x.shape[-1])
+    every = (x.repeat(1 + restarts, 1), std.expand_as(x).repeat(1 + restarts, 1))
+    z = _modes(decode, begin.flatten(0, 1), *every)
+    losses = _loss(decode, z, *every).view(1 + restarts, -1)
+    enough = losses.amin(0)
+    if near:
+        enough = (ALIKE**2 * enough).clamp(min=ENOUGH**2 * x.shape[-1])
     apart = (z.view(begin.shape) - start).square().sum(-1)
     apart = apart.masked_fill(losses > enough, torch.inf)
     best = apart.argmin(0)[None, :, None].expand(1, *start.shape)
     mode = z.view(begin.shape).gather(0, best)[0]
-    J = jacobians(decode, mode) / std[:, None]
+    J = jacobians(decode, mode) / std[..., None]
     eye = torch.eye(start.shape[-1], dtype=start.dtype, device=start.device)
     return MultivariateNormal(mode.detach(), precision_matrix=(J.mT @ J + eye).detach())
 
@@ -54,12 +60,12 @@ def _modes(
     decode: Callable[[Tensor], Tensor],
     z: Float[Tensor, "frame latent"],
     x: Float[Tensor, "frame channel"],
-    std: Float[Tensor, " channel"],
+    std: Float[Tensor, "frame channel"],
 ) -> Float[Tensor, "frame latent"]:
     damping = z.new_full((len(z), 1, 1), DAMPING)
     eye, loss = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device), _loss(decode, z, x, std)
     for _ in range(ITERATIONS):
-        J = jacobians(decode, z) / std[:, None]
+        J = jacobians(decode, z) / std[..., None]
         slope = z - (J.mT @ ((x - decode(z)) / std)[..., None])[..., 0]
         curvature = J.mT @ J + eye
         size = curvature.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]

@@ -89,7 +89,8 @@ class AeDmp(nn.Module):
     Forecasts and missing sections condition a mixture around the latent paths of the training
     movements on the frames seen (:class:`~zoo.dynamics.paths.PathPrior`), with draws; after
     training on a single movement it is as wide as that movement's own θ. Missing joints come from
-    the chain of §5.3.4 without the DMP. Movements must have one common length.
+    the chain of §5.3.4, frame by frame, and the primitive nearest to the path it finds, which the
+    thesis leaves out. Movements must have one common length.
     """
 
     config_class: ClassVar[type] = Config
@@ -163,12 +164,23 @@ class AeDmp(nn.Module):
         return self._decoded(self.imitator.roll_out(self._imitated(batch, posterior))[None])
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """Missing joints by the chain of §5.3.4; missing frames by the DMP given those seen."""
+        """Missing joints by the chain of §5.3.4 and a DMP; missing frames given those seen."""
         y, seen = self._encoded(batch, posterior)
         if bool(seen.all()):
-            return self._decoded(y[None])
+            return self._decoded(self._smoothed(y, batch.mask)[None])
         paths = self._completed(y, seen, self.frames, draws)
         return self._decoded(torch.where(seen[..., None], y, paths))
+
+    def _smoothed(
+        self,
+        y: Float[Tensor, "sequence time latent"],
+        mask: Bool[Tensor, "sequence time channel"] | None,
+    ) -> Float[Tensor, "sequence time latent"]:
+        """Roll-outs nearest to the paths of whole movements with missing joints."""
+        if mask is None or y.shape[1] != self.frames:
+            return y
+        rolled = self.imitator.roll_out(self.imitator.fit(y))
+        return torch.where(mask.all(-1).all(-1)[:, None, None], y, rolled)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
