@@ -102,7 +102,6 @@ _FORECASTERS = (
     "dvbf",
     "sparse-ae-dmp",
     "ae-then-dmp",
-    "dmp-rhythmic",
     "promp-rhythmic+vae-dmp-rhythmic",
 )
 _IMPUTERS = (
