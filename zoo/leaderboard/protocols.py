@@ -118,7 +118,7 @@ _IMPUTERS = (
     "vae-dmp",
     "vae-dmp-rhythmic",
     "nearest-neighbour+promp-rhythmic",
-    "nearest-neighbour+promp-rhythmic+vae-dmp-rhythmic",
+    "promp-rhythmic+vae-dmp-rhythmic",
 )
 _AE_DMP: Mapping[str, Any] = {"epochs": 1000}
 _WALK_SETTINGS: Settings = {
