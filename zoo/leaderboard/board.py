@@ -237,6 +237,7 @@ def _sentence(name: str, asked: Protocol, model: str, table: Table) -> dict[str,
 
 def _figure(asked: Protocol, table: Table, order: Sequence[str]) -> Figure:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(10, 0.36 * len(order) + 2), layout="constrained")
     error, band = figure.subplots(1, 2, sharey=True)
@@ -254,6 +255,10 @@ def _figure(asked: Protocol, table: Table, order: Sequence[str]) -> Figure:
     error.set_yticks(range(len(order)), order)
     error.invert_yaxis()
     error.set(xscale="log", xlabel="MSE / rad², groups in grey", title="Error, mean ± 95 %")
+    error.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    error.xaxis.set_major_formatter("{x:g}")
+    error.xaxis.set_minor_formatter(NullFormatter())
+    error.tick_params(axis="x", labelsize=8)
     band.axvspan(87, 93, color="0.92", zorder=0)
     band.axvline(90, color="0.6", lw=1)
     band.set(xlabel="truth inside the 90 % band / %", title="orange: raw, green: calibrated")
