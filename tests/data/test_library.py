@@ -59,6 +59,40 @@ def test_movements_of_the_thesis() -> None:
     assert data.units == ("rad",) * 50 and data.layout.rate is None
 
 
+@needs("thesis-movements")
+def test_punching_is_one_arm_along_a_line_and_tai_chi_moves_all_limbs() -> None:
+    data = zoo.load_data("thesis-movements")
+    limbs = "lhumerus", "rhumerus", ("lfemur", "ltibia"), ("rfemur", "rtibia")
+    for name, line, everywhere in (("punching", True, False), ("tai_chi", False, True)):
+        x = data.where(movement=name).values[0].double().numpy()
+        variance = np.linalg.svd(x - x.mean(0), compute_uv=False) ** 2
+        moved = [x[:, [c.startswith(limb) for c in data.channels]].var(0).sum() for limb in limbs]
+        assert (variance[0] > 0.7 * variance.sum()) == line
+        assert (min(moved) > 0.1 * x.var(0).sum()) == everywhere
+
+
+@needs("thesis-movements")
+def test_plain_dmp_errs_most_where_table_2_says_so() -> None:
+    data = zoo.load_data("thesis-movements")
+    error = {}
+    for name in ("kicking", "tai_chi", "punching"):
+        movement = data.where(movement=name)
+        run = zoo.fit(zoo.create("dmp", movement), movement)
+        residual = run.reconstruct(movement, draws=1).mean - movement.values
+        error[name] = float(residual.square().mean())
+    assert error["punching"] < 1e-4 < 1e-3 < min(error["kicking"], error["tai_chi"])
+
+
+@needs("thesis-movements")
+def test_a_file_with_two_names_exchanged_is_refused(tmp_path: Path) -> None:
+    with np.load(Path(DATA, "thesis-movements", "movements.npz")) as archive:
+        arrays = dict(archive)
+    arrays["punching"], arrays["tai_chi"] = arrays["tai_chi"], arrays["punching"]
+    np.savez(tmp_path / "movements.npz", **arrays)
+    with pytest.raises(FileFormatError, match="the two arrays have each other's names"):
+        zoo.load_data("thesis-movements", folder=tmp_path)
+
+
 def test_movements_of_the_thesis_that_are_not_as_they_should_be(tmp_path: Path) -> None:
     with pytest.raises(MissingDataError, match=r"movements\.npz is not in the folder"):
         zoo.load_data("thesis-movements", folder=tmp_path)
