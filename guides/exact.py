@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import pyro
-import pyro.distributions as dist
 import torch
 from torch import Tensor, nn
 
-from zoo.types import Batch, Layout
+from zoo.types import Batch, Layout, Sites
 
 __all__ = ["Config", "ExactPosterior", "KnowsPosterior"]
 
@@ -18,8 +18,8 @@ __all__ = ["Config", "ExactPosterior", "KnowsPosterior"]
 class KnowsPosterior(Protocol):
     """A model with closed-form inference."""
 
-    def posterior_of(self, batch: Batch) -> dict[str, dist.TorchDistribution]:
-        """p(latent site | data) by site name, its batch axis the windows."""
+    def posterior_sites(self, batch: Batch) -> Sites:
+        """p(latent sites | data): one distribution after the other, and their plate."""
         ...
 
 
@@ -40,8 +40,20 @@ class ExactPosterior(nn.Module):
         self._model = (model,)
 
     def forward(self, batch: Batch) -> dict[str, Tensor]:
-        """Draw every latent site from its posterior."""
+        """Draw every latent site from its posterior given those before it."""
         (model,) = self._model
-        sites = model.posterior_of(batch)
-        with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
-            return {name: pyro.sample(name, site) for name, site in sites.items()}
+        sites = model.posterior_sites(batch)
+        drawn: dict[str, Tensor] = {}
+        with _plate(sites):
+            for name, law in sites.of.items():
+                drawn[name] = pyro.sample(name, law(drawn))
+        return drawn
+
+
+def _plate(sites: Sites) -> AbstractContextManager[Any]:
+    if sites.plate is None:
+        return nullcontext()
+    plate: AbstractContextManager[Any] = pyro.plate(
+        sites.plate, size=sites.size, subsample=torch.arange(sites.rows)
+    )
+    return plate

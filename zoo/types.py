@@ -1,4 +1,4 @@
-"""Names of the tensor axes and the two records that models and the harness exchange.
+"""Names of the tensor axes and the records that models, guides and the harness exchange.
 
 Axes used in every shape annotation of the package:
 
@@ -19,14 +19,18 @@ Axes used in every shape annotation of the package:
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["Batch", "Layout", "Posterior"]
+if TYPE_CHECKING:
+    from pyro.distributions import TorchDistribution
+
+__all__ = ["Batch", "Layout", "Posterior", "Sites"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +85,8 @@ class Batch:
     For regression data ``values`` are the targets, ``inputs`` the features, ``time`` is absent
     and ``movements`` is empty. Missing entries are 0 in ``values`` and False in ``mask``;
     ``mask`` is None where nothing is missing. ``total`` and ``total_sequences`` count the whole
-    training set, so that a plate of that size scales a minibatch rightly.
+    training set, so that a plate of that size scales a minibatch rightly. Where ``observed`` is
+    False a program draws its data instead of observing them; see :meth:`unobserved`.
     """
 
     values: Float[Tensor, "window time channel"]
@@ -93,10 +98,22 @@ class Batch:
     movement_mask: Bool[Tensor, "sequence frame channel"] | None
     total: int
     total_sequences: int
+    observed: bool = True
 
     def __len__(self) -> int:
         """Number of windows."""
         return int(self.values.shape[0])
+
+    def unobserved(self) -> Self:
+        """The same batch for a program that draws its data: prior and posterior predictive.
+
+        Sizes, inputs and masks stay; so do the values, which only a guide may read.
+        """
+        return replace(self, observed=False)
+
+    def given(self, data: Tensor) -> Tensor | None:
+        """``obs=`` of an observed site: ``data``, or None where the program is to draw them."""
+        return data if self.observed else None
 
     def repeat(self, times: int) -> Self:
         """``times`` copies of the whole batch, one after the other, each with its own movements."""
@@ -108,6 +125,22 @@ class Batch:
         shift = torch.arange(times, device=self.sequence.device) * self.movements.shape[0]
         tiled["sequence"] = (self.sequence + shift[:, None]).flatten()
         return replace(self, **tiled)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sites:
+    """The latent sites of an exact posterior, in the order in which they are drawn.
+
+    ``of`` gives the distribution of each site from the values drawn before it, by name, so that
+    p(a, b | x) = p(a | x) p(b | a, x) is ``{"a": lambda _: p_a, "b": lambda drawn: ...}``. All
+    stand in the plate ``plate`` of ``size`` independent parts, ``rows`` of which are in the batch;
+    ``plate`` is None for a posterior that is not such a product.
+    """
+
+    plate: str | None
+    size: int
+    rows: int
+    of: Mapping[str, Callable[[Mapping[str, Tensor]], TorchDistribution]]
 
 
 class Posterior(Protocol):

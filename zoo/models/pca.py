@@ -15,7 +15,7 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotFittedError
 from zoo.inference.factors import Factors, closed_form, expectation_maximisation
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior
+from zoo.types import Batch, Layout, Posterior, Sites
 
 __all__ = ["PCA", "Config"]
 
@@ -105,13 +105,13 @@ class PCA(nn.Module):
             prior = dist.Normal(f.mean.new_zeros(()), 1.0).expand(shape).to_event(2)
             z = pyro.sample("z", prior)
             likelihood = dist.Normal(z @ f.loading.T + f.mean, f.noise).mask(mask).to_event(2)
-            x: Tensor = pyro.sample("x", likelihood, obs=batch.values)
+            x: Tensor = pyro.sample("x", likelihood, obs=batch.given(batch.values))
         return x
 
-    def posterior_of(self, batch: Batch) -> dict[str, dist.TorchDistribution]:
-        """The exact p(z | x_seen), site by site."""
-        mean, covariance = self._posterior(batch)
-        return {"z": dist.MultivariateNormal(mean, covariance).to_event(1)}
+    def posterior_sites(self, batch: Batch) -> Sites:
+        """The exact p(z | x) of the entries observed."""
+        z = dist.MultivariateNormal(*self._posterior(batch)).to_event(1)
+        return Sites(plate="windows", size=batch.total, rows=len(batch), of={"z": lambda _: z})
 
     def log_evidence(self, batch: Batch) -> Float[Tensor, ""]:
         """log p(x_seen), summed over all frames of the batch."""
