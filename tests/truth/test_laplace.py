@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from scipy.optimize import minimize
 
@@ -69,3 +70,16 @@ def test_the_best_mode_is_taken_unless_the_nearest_is_asked_for() -> None:
     near, best = (laplace(decode, start, x, torch.full((2,), 0.1), near=n) for n in (True, False))
     assert float(near.mean) < -1.5
     assert float(best.mean) > 1.5
+
+
+@pytest.mark.parametrize("unit", [1.0, 57.3], ids=["radians", "degrees"])
+def test_float32_gives_the_covariance_of_independent_directions(unit: float) -> None:
+    """JᵀJ is diagonal, of 1e6 and more: what float32 leaves beside it is not symmetric."""
+    torch.manual_seed(0)
+    W = 10 * unit * torch.linalg.qr(torch.randn(62, 3))[0]
+    σ, z = torch.full((62,), 0.01), torch.randn(30, 3)
+    found = laplace(lambda z: z @ W.T, z, z @ W.T, σ, restarts=2)
+    precision = 1 + (10 * unit / 0.01) ** 2
+    assert found.mean.dtype == found.covariance_matrix.dtype == torch.float32
+    expected = torch.eye(3).expand(30, 3, 3)
+    torch.testing.assert_close(precision * found.covariance_matrix, expected, atol=1e-4, rtol=1e-4)

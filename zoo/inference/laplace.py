@@ -21,7 +21,7 @@ def laplace(
     decode: Callable[[Tensor], Tensor],
     start: Float[Tensor, "frame latent"],
     x: Float[Tensor, "frame channel"],
-    std: Float[Tensor, "#frame channel"],
+    std: Float[Tensor, "*#frame channel"],
     *,
     restarts: int = 16,
     near: bool = True,
@@ -51,9 +51,22 @@ def laplace(
     apart = apart.masked_fill(losses > enough, torch.inf)
     best = apart.argmin(0)[None, :, None].expand(1, *start.shape)
     mode = z.view(begin.shape).gather(0, best)[0]
-    J = jacobians(decode, mode) / std[..., None]
-    eye = torch.eye(start.shape[-1], dtype=start.dtype, device=start.device)
-    return MultivariateNormal(mode.detach(), precision_matrix=(J.mT @ J + eye).detach())
+    return MultivariateNormal(mode.detach(), scale_tril=_root(decode, mode, std).detach())
+
+
+def _root(
+    decode: Callable[[Tensor], Tensor],
+    z: Float[Tensor, "frame latent"],
+    std: Float[Tensor, "*#frame channel"],
+) -> Float[Tensor, "frame latent latent"]:
+    """A Cholesky factor of (I + JᵀJ/σ²)⁻¹, in float64 inside: JᵀJ/σ² may be 1e8 and more."""
+    J = jacobians(decode, z).double() / std[..., None].double()
+    precision = J.mT @ J + torch.eye(z.shape[-1], dtype=J.dtype, device=J.device)
+    flipped = torch.linalg.cholesky((precision + precision.mT).flip(-2, -1) / 2)
+    upper = flipped.flip(-2, -1)
+    eye = torch.eye(z.shape[-1], dtype=J.dtype, device=J.device).expand_as(upper)
+    root: Tensor = torch.linalg.solve_triangular(upper.mT, eye, upper=False)
+    return root.to(z)
 
 
 def _modes(
