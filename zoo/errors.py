@@ -12,6 +12,7 @@ __all__ = [
     "TrainingError",
     "TrainingWarning",
     "UnknownNameError",
+    "UnlikeUnitsWarning",
 ]
 
 
@@ -60,3 +61,7 @@ class TrainingWarning(UserWarning):
 
 class PosteriorCollapseWarning(UserWarning):
     """Latent dimensions carry nothing: their posterior is the prior."""
+
+
+class UnlikeUnitsWarning(UserWarning):
+    """Channels of several units are scaled by one number."""

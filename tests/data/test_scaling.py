@@ -1,5 +1,7 @@
 """Scaling: moments of the observed entries, the way back, and what does not vary."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.datasets.scaling import Kind, Scaler
+from zoo.errors import UnlikeUnitsWarning
 
 KINDS: tuple[Kind, ...] = ("standard", "center", "range", "none")
 
@@ -35,7 +38,9 @@ def test_the_way_back_gives_the_data(kind: Kind) -> None:
 def test_moments_are_those_of_the_observed_entries() -> None:
     data = ragged()
     entries = np.concatenate(data.arrays)
-    for kind, expected in (("standard", np.nanstd(entries, 0)), ("center", np.ones(3))):
+    std = np.nanstd(entries, 0)
+    pooled = np.full(3, np.sqrt((std**2).mean()) / 0.2)
+    for kind, expected in (("standard", std), ("center", pooled)):
         scaler = Scaler.fit(data, kind)  # type: ignore[arg-type]
         np.testing.assert_allclose(scaler.channel_shift, np.nanmean(entries, 0), rtol=1e-12)
         np.testing.assert_allclose(scaler.channel_scale[:2], expected[:2], rtol=1e-12)
@@ -55,6 +60,24 @@ def test_a_channel_that_does_not_vary_is_named_and_keeps_its_unit(kind: Kind) ->
     scaler = Scaler.fit(ragged(), kind)
     assert scaler.constant == ("flat",)
     assert scaler.channel_scale[2] == 1
+
+
+@pytest.mark.parametrize("kind", ["standard", "center", "range"])
+@pytest.mark.parametrize("factor", [2.0**-40, 2.0**6, 2.0**40])
+def test_scaled_numbers_do_not_depend_on_the_unit(kind: Kind, factor: float) -> None:
+    """A power of two changes no digit, so that the scaled data must keep their bits."""
+    data = ragged()
+    other = replace(data, values=data.values * factor, units=("mrad",) * 3)
+    one, two = Scaler.fit(data, kind), Scaler.fit(other, kind)
+    assert torch.equal(one.apply(data).values, two.apply(other).values)
+    assert one.constant == two.constant == ("flat",)
+
+
+def test_one_scale_for_channels_of_several_units_is_warned_of() -> None:
+    mixed = replace(ragged(), units=("m", "rad", "rad"))
+    with pytest.warns(UnlikeUnitsWarning, match="channels in m, rad by one number"):
+        Scaler.fit(mixed, "center")
+    Scaler.fit(mixed, "standard")
 
 
 def test_padding_and_missing_entries_have_no_say() -> None:
