@@ -2,6 +2,7 @@
 
 __all__ = [
     "DamagedRunError",
+    "FewerInducingWarning",
     "NoDensityError",
     "NoJointSamplesError",
     "NoSpreadError",
@@ -9,6 +10,7 @@ __all__ = [
     "NotCapableError",
     "NotFittedError",
     "PosteriorCollapseWarning",
+    "TooManyItemsError",
     "TrainingError",
     "TrainingWarning",
     "UnknownNameError",
@@ -45,6 +47,14 @@ class NoJointSamplesError(ValueError):
 
 class DamagedRunError(ValueError):
     """A run folder or file that is damaged, foreign, or of an unknown format version."""
+
+
+class TooManyItemsError(ValueError):
+    """More items than an exact method can hold; the message says what it needs and what to take."""
+
+
+class FewerInducingWarning(UserWarning):
+    """A fraction of the items would be more inducing inputs than pay off; fewer were taken."""
 
 
 class TrainingError(RuntimeError):

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from pyro import poutine
+from pyro.distributions import MultivariateNormal
+from pyro.infer import Predictive
 from scipy.stats import multivariate_normal
 
 from zoo.datasets.records import Pairs
+from zoo.errors import TooManyItemsError
+from zoo.guides.exact import Config, ExactPosterior
+from zoo.inference.elbo import bound
 from zoo.inference.loader import whole
 from zoo.inference.marginal import evaluator, fit_marginal
 from zoo.models import gp
@@ -95,13 +100,67 @@ def test_posterior_is_the_formula(settings):
 
 
 @KINDS
-def test_program_has_the_objective_as_its_density(settings):
+def test_the_bound_is_the_dense_evidence_at_every_draw(settings):
     data = pairs()
     model = conditioned(data, **settings)
-    expected = -model.objective().item()
+    parts = [solved(model, data, p) for p in range(2)]
+    evidence = sum(multivariate_normal(cov=s * c).logpdf(y) for _, y, c, s in parts)
     model.settle()
-    trace = poutine.trace(model).get_trace(whole(data))
-    assert trace.log_prob_sum().item() == pytest.approx(expected, rel=1e-9)
+    guide = ExactPosterior(data.layout, model, Config())
+    found = [bound(model, guide, whole(data)).elbo.item() for _ in range(5)]
+    np.testing.assert_allclose(found, evidence, rtol=1e-8)
+
+
+def test_the_bound_is_not_the_evidence_of_a_guide_with_a_flipped_sign():
+    data = pairs()
+    model = conditioned(data)
+    evidence = -model.objective().item()
+    model.settle()
+    guide = ExactPosterior(data.layout, model, Config())
+    truth = model.posterior_sites(whole(data))
+
+    def flipped(batch):
+        law = truth.of["f"]({})
+        wrong = MultivariateNormal(-law.loc, scale_tril=law.scale_tril)
+        return replace(truth, of={"f": lambda _: wrong})
+
+    model.posterior_sites = flipped
+    found = [bound(model, guide, whole(data)).elbo.item() for _ in range(5)]
+    assert max(found) < evidence - 10
+
+
+def test_the_posterior_of_f_is_the_formula_at_the_training_inputs():
+    data = pairs()
+    model = conditioned(data)
+    model.settle()
+    f = model.posterior_sites(whole(data)).of["f"]({})
+    p = model.regress(data.inputs, draws=0)
+    torch.testing.assert_close(f.mean.mT, p.location[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(f.variance.mT, p.epistemic[0].square(), rtol=0, atol=1e-6)
+
+
+def test_prior_draws_have_the_covariance_of_the_evidence():
+    data = pairs(items=6, missing=0)
+    model = conditioned(data)
+    model.settle()
+    torch.manual_seed(0)
+    draw = Predictive(model, num_samples=20_000, parallel=True)
+    y = draw(whole(data).unobserved())["y"].detach().squeeze()
+    assert y.shape == (20_000, 2, 6)
+    for target in range(2):
+        _, _, c, signal = solved(model, data, target)
+        ours = np.cov(y[:, target].numpy().T) / signal
+        error = np.sqrt((c**2 + np.outer(np.diag(c), np.diag(c))) / 20_000)
+        assert (np.abs(ours - c) < 6 * error).all()
+
+
+def test_more_items_than_memory_are_refused_by_name():
+    rng = np.random.default_rng(0)
+    data = Pairs.from_arrays(rng.normal(size=(41_000, 2)), rng.normal(size=(41_000, 1)))
+    with pytest.raises(TooManyItemsError, match=r"41000 items need some 188.3 GB.*'fitc' or 'vfe'"):
+        gp.GaussianProcess(data.layout, gp.Config()).condition(data)
+    with pytest.raises(TooManyItemsError, match=r"memory=0.0001 GB"):
+        conditioned(pairs(), memory=1e-4)
 
 
 def drawn_from_the_prior(items=200, length=0.7, noise=0.3, targets=3):

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 
 import gpytorch
 import numpy as np
 import pytest
 import torch
 from pyro import poutine
+from pyro.distributions import MultivariateNormal
+from pyro.infer import Predictive
 from scipy.stats import multivariate_normal
 
 from zoo.datasets.records import Pairs
-from zoo.errors import NoiseDivergenceWarning
-from zoo.inference.loader import whole
+from zoo.errors import FewerInducingWarning, NoiseDivergenceWarning
+from zoo.guides.exact import Config, ExactPosterior
+from zoo.inference import elbo
+from zoo.inference.loader import Loader, whole
 from zoo.inference.marginal import evaluator, fit_marginal
 from zoo.models import gp, sparse_gp
 from zoo.strategies import MarginalLikelihood
+from zoo.types import Sites
 
 BOUNDS = ("fitc", "vfe")
 
@@ -83,7 +89,8 @@ def test_gradients_are_the_differences(bound, settings):
     data = pairs(missing=7)
     model = conditioned(data, bound=bound, jitter=1e-4, **settings)
     evaluate = evaluator(model)
-    x = torch.nn.utils.parameters_to_vector(model.parameters()).detach().numpy().copy()
+    trained = [p for p in model.parameters() if p.requires_grad]
+    x = torch.nn.utils.parameters_to_vector(trained).detach().numpy().copy()
     _, gradient = evaluate(x)
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -196,13 +203,59 @@ def test_vfe_equals_gpytorch_sgpr():
 
 
 @pytest.mark.parametrize("bound", BOUNDS)
-def test_program_has_the_objective_as_its_density(bound):
+def test_the_bound_is_the_dense_one_at_every_draw(bound):
     data = pairs(missing=6)
     model = conditioned(data, bound=bound)
-    expected = -model.objective().item()
+    expected = -dense_objective(model, data)
     model.settle()
-    trace = poutine.trace(model).get_trace(whole(data))
-    assert trace.log_prob_sum().item() == pytest.approx(expected, rel=1e-8)
+    guide = ExactPosterior(data.layout, model, Config())
+    found = [elbo.bound(model, guide, whole(data)).elbo.item() for _ in range(5)]
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    law = model.posterior_sites(whole(data)).of["v"]({})
+    with pytest.raises(ValueError, match="needs all 80 items at once; got 20"):
+        guide(Loader(data, batch_size=20).take(torch.arange(20)))
+    model.posterior_sites = lambda batch: replace(sites, of={"v": lambda _: flipped})
+    sites = Sites(plate="targets", size=2, rows=2, of={})
+    flipped = MultivariateNormal(-law.loc, scale_tril=law.scale_tril)
+    found = [elbo.bound(model, guide, whole(data)).elbo.item() for _ in range(5)]
+    assert max(found) < expected - 10
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_minibatches_are_the_bound_on_average(bound):
+    data = pairs()
+    model = conditioned(data, bound=bound)
+    model.settle()
+    guide = ExactPosterior(data.layout, model, Config())
+    given = poutine.trace(guide).get_trace(whole(data))
+    loader = Loader(data, batch_size=20)
+    terms = [
+        poutine.trace(poutine.replay(model, given)).get_trace(batch).log_prob_sum().item()
+        for batch in loader.sweep()
+    ]
+    all_at_once = poutine.trace(poutine.replay(model, given)).get_trace(whole(data))
+    assert np.mean(terms) == pytest.approx(all_at_once.log_prob_sum().item(), rel=1e-9)
+
+
+@pytest.mark.parametrize("bound", BOUNDS)
+def test_prior_draws_have_the_covariance_of_the_bound(bound):
+    data = pairs(items=8, targets=1)
+    model = conditioned(data, bound=bound, inducing=4)
+    model.settle()
+    torch.manual_seed(0)
+    draw = Predictive(model, num_samples=20_000, parallel=True, return_sites=("u", "y"))
+    drawn = draw(whole(data).unobserved())
+    x, z = data.inputs.numpy(), model.inducing.numpy()
+    length, signal = model.length.item(), model.signal.item()
+    k_uu, k_fu = gram(z, z, length), gram(x, z, length)
+    q = k_fu @ np.linalg.solve(k_uu, k_fu.T)
+    left = np.diag(1 - np.diag(q)) * (bound == "fitc")
+    c = q + left + model.noise.item() * np.eye(8)
+    for name, expected in (("u", k_uu), ("y", c)):
+        ours = np.cov(drawn[name].detach().squeeze().numpy().T) / signal
+        variance = np.diag(expected)
+        error = np.sqrt((expected**2 + np.outer(variance, variance)) / 20_000)
+        assert (np.abs(ours - expected) < 6 * error).all()
 
 
 def test_newton_and_l_bfgs_find_the_same_optimum():
@@ -247,6 +300,19 @@ def test_joint_draws_have_the_moments():
     assert ((p.draws.mean(0) - p.location[0]).abs() < 6 * error).all()
     spread = p.draws.std(0) / p.epistemic[0]
     assert ((spread - 1).abs() < 6 / math.sqrt(2 * 20_000)).all()
+
+
+def test_a_fraction_of_many_items_is_capped_with_a_warning():
+    rng = np.random.default_rng(0)
+    data = Pairs.from_arrays(rng.normal(size=(300, 2)), rng.normal(size=(300, 1)))
+    config = sparse_gp.Config(most_inducing=40)
+    with pytest.warns(FewerInducingWarning, match="51 inducing inputs; 40 are taken"):
+        model = sparse_gp.SparseGaussianProcess(data.layout, config)
+        model.condition(data)
+    assert model.report()["inducing"] == 40
+    with pytest.warns(FewerInducingWarning, match="of 41000 items would be 6970"):
+        assert sparse_gp.Config().count(41_000) == 1000
+    assert sparse_gp.Config(inducing=2000).count(41_000) == 2000
 
 
 def test_settings_and_data_that_cannot_be_are_refused():

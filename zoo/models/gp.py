@@ -6,19 +6,23 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import pyro
+import pyro.distributions as dist
 import torch
 from jaxtyping import Float
-from pyro.distributions import MultivariateNormal
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
+from zoo.errors import NotFittedError, TooManyItemsError
 from zoo.inference.evidence import dense, pairs_of, patterns
-from zoo.nn.gaussian import joint_draws
+from zoo.nn.gaussian import joint_draws, white_posterior
 from zoo.nn.kernels import median_distance, squared_distances, squared_exponential
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout
+from zoo.types import Batch, Layout, Sites
 
 __all__ = ["Config", "GaussianProcess"]
+
+SHARE = 1e-2
+HELD, HELD_A_KERNEL = 10, 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +31,8 @@ class Config:
 
     ``shared``: one length scale and noise ratio for all targets, hence one factorisation; ``ard``:
     a length scale for each feature; ``noise_floor``: smallest σ_n²/σ_f²; ``noise``: its starting
-    value; ``joint_items``: up to so many new items are drawn jointly.
+    value; ``joint_items``: up to so many new items are drawn jointly; ``memory``: what the matrices
+    of items × items may take in GB. Some 14 are held at once for one target: 8 GB are 8,400 items.
     """
 
     shared: bool = False
@@ -35,6 +40,7 @@ class Config:
     noise: float = 0.1
     noise_floor: float = 1e-6
     joint_items: int = 512
+    memory: float = 8.0
 
     def __post_init__(self) -> None:
         """Refuse settings that have no meaning."""
@@ -44,6 +50,8 @@ class Config:
             )
         if self.joint_items < 0:
             raise ValueError(f"joint_items must not be negative; got {self.joint_items}")
+        if not self.memory > 0:
+            raise ValueError(f"memory must be positive, in GB; got {self.memory}")
 
 
 class _Group(NamedTuple):
@@ -62,6 +70,10 @@ class GaussianProcess(nn.Module):
     the evidence (41) with the gradient (42); σ_f² is profiled out. Each target has its own
     hyperparameters unless ``shared``. Missing targets are left out, target by target. Thesis
     §2.1.6 and §3.2.3, with the squared distance that (35) means; Rasmussen & Williams (2006).
+
+    The posterior of f is exact given l, σ_n and σ_f, which are point estimates: their uncertainty
+    is not in the bands. The Pyro program draws f at the inputs and y given f; 1 % of
+    ``noise_floor`` is counted to f there, so that its covariance has a factor: p(y) stays the same.
 
     Cost grows with the cube of the items: up to some 3000; ``fitc`` goes beyond. It gives no
     joint distribution over targets, which are independent in this model.
@@ -101,6 +113,7 @@ class GaussianProcess(nn.Module):
     def condition(self, data: Sequences | Pairs) -> None:
         """Take in the training pairs; start at the median distance and the configured noise."""
         data = pairs_of(data)
+        self._check_size(len(data))
         self.inputs, self.targets = data.inputs.to(self.dtype), data.targets.to(self.dtype)
         self.observed = data.mask.to(self.dtype)
         self._distances = squared_distances(self.inputs, self.inputs)
@@ -150,20 +163,27 @@ class GaussianProcess(nn.Module):
             draws=paths,
         )
 
-    def forward(self, batch: Batch) -> None:
-        """p(y | x) of a whole training set, f integrated out; its log density is the evidence."""
-        if batch.inputs is None or len(batch) != batch.total:
-            raise ValueError(f"the evidence needs all {batch.total} items with inputs at once")
-        x = batch.inputs.reshape(len(batch), -1)
-        y = batch.values.reshape(len(batch), -1)
-        mask = torch.ones_like(y, dtype=torch.bool) if batch.mask is None else batch.mask
-        for p in range(y.shape[1]):
-            rows = mask.reshape(y.shape)[:, p]
-            kernel = 0 if self.config.shared else p
-            covariance = self._kernel(kernel, x[rows], x[rows])
-            covariance = covariance + torch.diag(self.noise[kernel].expand(len(covariance)))
-            law = MultivariateNormal(torch.zeros_like(y[rows, p]), self.signal[p] * covariance)
-            pyro.sample(f"y_{p}", law, obs=y[rows, p])
+    def forward(self, batch: Batch) -> Tensor:
+        """The generative program: f of every target at the inputs, then y."""
+        y, mask = self._observations(batch)
+        std = (self.signal * self._rest).sqrt()
+        with pyro.plate("targets", len(y)):
+            root = self.signal.sqrt()[:, None, None] * self._root(batch)
+            f = pyro.sample("f", dist.MultivariateNormal(torch.zeros_like(y), scale_tril=root))
+            law = dist.Normal(f, std[:, None]).mask(mask).to_event(1)
+            drawn: Tensor = pyro.sample("y", law, obs=batch.given(y))
+        return drawn
+
+    def posterior_sites(self, batch: Batch) -> Sites:
+        """The exact p(f | y) at the inputs of ``batch``, its hyperparameters point estimates."""
+        y, mask = self._observations(batch)
+        root = self._root(batch)
+        mean, narrow = white_posterior(root.mT, mask / self._rest[:, None], y)
+        f = dist.MultivariateNormal(
+            (root @ mean[..., None])[..., 0],
+            scale_tril=self.signal.sqrt()[:, None, None] * (root @ narrow),
+        )
+        return Sites(plate="targets", size=len(y), rows=len(y), of={"f": lambda _: f})
 
     def report(self) -> dict[str, Any]:
         """Hyperparameters in the model's scale."""
@@ -172,6 +192,46 @@ class GaussianProcess(nn.Module):
             "signal_std": self.signal.sqrt().tolist(),
             "noise_std": self._noise_variance().sqrt().tolist(),
         }
+
+    @property
+    def _rest(self) -> Float[Tensor, " target"]:
+        """σ_n²/σ_f² of every target without the share of the noise that f takes over."""
+        return (self.noise - self._share).expand(len(self.signal))
+
+    @property
+    def _share(self) -> float:
+        return SHARE * self.config.noise_floor
+
+    def _root(self, batch: Batch) -> Float[Tensor, "kernel item item"]:
+        """Lower roots of κ at the inputs, with a share of the noise so that they exist."""
+        if batch.inputs is None or len(batch) != batch.total:
+            raise ValueError(f"f needs all {batch.total} items with inputs at once")
+        x = batch.inputs.flatten(1)
+        kernels = range(len(self.log_noise))
+        covariance = torch.stack([self._kernel(k, x, x) for k in kernels])
+        share = covariance.new_full((len(x),), self._share)
+        root: Tensor = torch.linalg.cholesky(covariance + torch.diag(share))
+        return root
+
+    def _observations(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Targets of all items, and which of them were observed, shape (target, item)."""
+        if self.signal.numel() == 0:
+            raise NotFittedError("gp has no signal variance yet; call zoo.fit first")
+        y = batch.values.flatten(1).mT
+        if batch.mask is None:
+            return y, torch.ones_like(y, dtype=torch.bool)
+        return y, batch.mask.flatten(1).mT
+
+    def _check_size(self, items: int) -> None:
+        """Refuse before the first matrix is made what would not fit."""
+        needed = 8e-9 * items**2 * (HELD + HELD_A_KERNEL * len(self.log_noise))
+        if needed > self.config.memory:
+            raise TooManyItemsError(
+                f"gp is exact and holds matrices of items × items: {items} items need some "
+                f"{needed:.1f} GB, and memory={self.config.memory:g} GB is allowed; take 'fitc' or "
+                "'vfe', whose cost grows with the items alone, a subset of the items, or a larger "
+                "memory"
+            )
 
     def _groups(self) -> list[_Group]:
         found = []

@@ -3,85 +3,29 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
 
 import pyro
+import pyro.distributions as dist
 import torch
 from jaxtyping import Float
-from pyro.distributions import LowRankMultivariateNormal
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import NoiseDivergenceWarning
+from zoo.errors import NoiseDivergenceWarning, NotFittedError
 from zoo.inference.collapsed import Collapsed
 from zoo.inference.evidence import pairs_of, patterns
 from zoo.inference.marginal import evaluator, maximise
-from zoo.nn.gaussian import joint_draws
+from zoo.models.inducing import Config, Training, View
+from zoo.nn.gaussian import joint_draws, white_posterior
 from zoo.nn.kernels import median_distance, squared_distances, squared_exponential
 from zoo.prediction import Predictive
 from zoo.strategies import MarginalLikelihood
-from zoo.types import Batch, Layout
+from zoo.types import Batch, Layout, Sites
 
 __all__ = ["Config", "SparseGaussianProcess"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Config:
-    """Settings of :class:`SparseGaussianProcess`.
-
-    ``inducing``: how many inducing inputs are drawn from the data, or which fraction of it (17 %
-    in §3.3.4); ``learn_inducing`` moves them by gradient; ``ard``: a length scale for each feature;
-    ``jitter``: variance, in units of σ_f², of the noise with which u observes f at the inducing
-    inputs, a part of the model; ``noise_floor``: smallest σ_n²/σ_f²; ``noise``: its starting value;
-    ``compare``: fit the other bound beside FITC and warn where the noise standard deviations
-    differ by more than the factor ``divergence``; ``joint_items``: up to so many new items are
-    drawn jointly.
-    """
-
-    bound: Literal["fitc", "vfe"] = "fitc"
-    inducing: int | float = 0.17
-    learn_inducing: bool = False
-    ard: bool = False
-    noise: float = 0.1
-    noise_floor: float = 1e-6
-    jitter: float = 1e-8
-    compare: bool = True
-    divergence: float = 2.0
-    joint_items: int = 512
-
-    def __post_init__(self) -> None:
-        """Refuse settings that have no meaning."""
-        if self.bound not in ("fitc", "vfe"):
-            raise ValueError(f"bound is fitc or vfe; got {self.bound!r}")
-        whole = float(self.inducing).is_integer()
-        if self.inducing <= 0 or (self.inducing > 1 and not whole):
-            raise ValueError(f"inducing is a number or a fraction up to 1; got {self.inducing}")
-        if not 0 < self.noise_floor < self.noise:
-            raise ValueError(
-                f"0 < noise_floor < noise is needed; got {self.noise_floor} and {self.noise}"
-            )
-        if self.jitter < 0 or self.divergence <= 1:
-            raise ValueError(
-                f"jitter ≥ 0 and divergence > 1 are needed; got {self.jitter}, {self.divergence}"
-            )
-
-    def count(self, items: int) -> int:
-        """Number of inducing inputs for a training set of so many items."""
-        many = isinstance(self.inducing, int) or self.inducing > 1
-        number = int(self.inducing) if many else max(1, round(self.inducing * items))
-        if number > items:
-            raise ValueError(f"{number} inducing inputs cannot be drawn from {items} items")
-        return number
-
-
-class _Training(NamedTuple):
-    """What only training needs: inputs, the bound of their targets, and squared distances."""
-
-    inputs: Tensor
-    bound: Collapsed
-    among: Tensor
-    across: Tensor
 
 
 class SparseGaussianProcess(nn.Module):
@@ -93,7 +37,12 @@ class SparseGaussianProcess(nn.Module):
     likelihood and pays tr(K − Q)/2σ_n² instead (Titsias 2009). Both have q(u) in closed form and
     u integrated out. Inducing inputs are drawn from the data (thesis §2.1.6, 17 % in §3.3.4) and
     fixed unless ``learn_inducing``; targets share length scale and noise ratio σ_n²/σ_f², hence
-    both Cholesky factors, and each has its own σ_f², profiled out.
+    both Cholesky factors, and each has its own σ_f², profiled out. q(u) is exact given these, which
+    are point estimates: their uncertainty is not in the bands.
+
+    The Pyro program draws v ~ N(0, I), u = σ_f L v with K_uu = L Lᵀ, then y. Items are independent
+    given u, so that an automatic guide learns q(v) and the hyperparameters from minibatches
+    (``guide="auto-normal"``; Hensman et al. 2013 for VFE).
 
     FITC tends to take the noise too small and VFE too large (Bauer et al. 2016): a fit of
     ``fitc`` fits ``vfe`` beside it and warns where they part. Cost grows with items · m²; it gives
@@ -104,9 +53,8 @@ class SparseGaussianProcess(nn.Module):
     dtype: ClassVar[torch.dtype] = torch.float64
 
     inducing: Tensor
-    signal: Tensor
     factor: Tensor
-    information: Tensor
+    root: Tensor
     mean: Tensor
     pattern: Tensor
     other_noise: Tensor
@@ -118,10 +66,12 @@ class SparseGaussianProcess(nn.Module):
         lengths = len(layout.inputs) if config.ard else 1
         self.log_length = nn.Parameter(torch.zeros(lengths, dtype=self.dtype))
         self.log_noise = nn.Parameter(torch.zeros((), dtype=self.dtype))
+        signal = torch.zeros(len(layout.channels), dtype=self.dtype)
+        self.log_signal = nn.Parameter(signal, requires_grad=False)
         self._set_inducing(torch.empty(0, dtype=self.dtype))
-        for name in ("signal", "factor", "information", "mean", "pattern", "other_noise"):
+        for name in ("factor", "root", "mean", "pattern", "other_noise"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
-        self._training: _Training | None = None
+        self._training: Training | None = None
 
     @property
     def length(self) -> Float[Tensor, " feature"]:
@@ -134,26 +84,42 @@ class SparseGaussianProcess(nn.Module):
         return self.config.noise_floor + self.log_noise.exp()
 
     @property
+    def signal(self) -> Float[Tensor, " target"]:
+        """Signal variance σ_f² of every target."""
+        return self.log_signal.exp()
+
+    @property
     def noise_std(self) -> Float[Tensor, " target"]:
         """σ_n of every target."""
         return (self.noise * self.signal).sqrt().detach()
 
     def condition(self, data: Sequences | Pairs) -> None:
         """Take in the training pairs, draw inducing inputs, compute their distances once."""
-        data = pairs_of(data)
-        known = data.mask.any(1).nonzero()[:, 0]
-        order = torch.randperm(len(known), device=known.device)[: self.config.count(len(known))]
-        self._set_inducing(data.inputs[known[order]].to(self.dtype))
-        self._training = _Training(
+        data = self._begin(data)
+        self._training = Training(
             data.inputs,
             Collapsed(data.targets.to(self.dtype), patterns(data.mask), self.config.bound),
             *self._distances(data.inputs),
         )
-        with torch.no_grad():
-            self.log_length.fill_(median_distance(self._training.among).log())
-            self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
         if self.config.learn_inducing or self.config.ard:
             self._warm_start()
+
+    def prepare(self, data: Sequences | Pairs) -> None:
+        """Inducing inputs and starting values for steps of the bound, which learn σ_f² as well."""
+        data = self._begin(data)
+        square = (data.targets.square() * data.mask).sum(0) / data.mask.sum(0)
+        with torch.no_grad():
+            self.log_signal.copy_(square.log())
+        self.log_signal.requires_grad_(True)
+
+    @torch.no_grad()
+    def adopt(self, found: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+        """Predict from a Gaussian q(v): its mean and a root of its covariance, for every target."""
+        mean, self.root = found["v"]
+        self.mean = (self.signal.sqrt()[:, None] * mean).mT
+        self.pattern = torch.arange(len(mean)).to(mean)
+        k_uu = self._kernel(self.inducing, self.inducing)
+        self.factor = torch.linalg.cholesky(self._jittered(k_uu))
 
     def objective(self) -> Float[Tensor, ""]:
         """Minus the collapsed bound on the log evidence, summed over targets."""
@@ -177,8 +143,8 @@ class SparseGaussianProcess(nn.Module):
         variance = torch.empty_like(mean)
         joint = draws > 0 and len(inputs) <= self.config.joint_items
         paths = mean.new_empty(draws, *mean.shape) if joint else None
-        for i, information in enumerate(self.information):
-            which, w = self.pattern == i, torch.linalg.solve_triangular(information, v, upper=False)
+        for i, root in enumerate(self.root):
+            which, w = self.pattern == i, root.mT @ v
             left = (1 - v.square().sum(0) + w.square().sum(0)).clamp_min(0)
             variance[:, which] = left[:, None] * self.signal[which]
             if paths is not None:
@@ -192,25 +158,34 @@ class SparseGaussianProcess(nn.Module):
             draws=paths,
         )
 
-    def forward(self, batch: Batch) -> None:
-        """p(y | x) of a whole training set, u and f integrated out."""
-        if batch.inputs is None or len(batch) != batch.total:
-            raise ValueError(f"the evidence needs all {batch.total} items with inputs at once")
-        y = batch.values.reshape(len(batch), -1)
-        mask = torch.ones_like(y, dtype=torch.bool) if batch.mask is None else batch.mask
-        factor = torch.linalg.cholesky(self._jittered(self._kernel(self.inducing, self.inducing)))
-        k_uf = self._kernel(self.inducing, batch.inputs.reshape(len(batch), -1))
-        v = torch.linalg.solve_triangular(factor, k_uf, upper=False)
-        left = 1 - v.square().sum(0)
-        fitc = self.config.bound == "fitc"
-        for p in range(y.shape[1]):
-            rows, signal = mask.reshape(y.shape)[:, p], self.signal[p]
-            diagonal = left[rows] + self.noise if fitc else self.noise.expand(int(rows.sum()))
-            loading = v.mT[rows] * signal.sqrt()
-            law = LowRankMultivariateNormal(torch.zeros_like(diagonal), loading, signal * diagonal)
-            pyro.sample(f"y_{p}", law, obs=y[rows, p])
-            if not fitc:
-                pyro.factor(f"trace_{p}", -left[rows].sum() / (2 * self.noise))
+    def forward(self, batch: Batch) -> Tensor:
+        """The generative program: u = σ_f L v of every target, then y; a minibatch stands for all.
+
+        With ``bound="vfe"`` the factor −tr(K − Q)/2σ_n² belongs to it.
+        """
+        view, scale = self._view(batch), self.signal.sqrt()[:, None]
+        unit = dist.Normal(torch.zeros_like(scale), 1.0)
+        with pyro.plate("targets", len(scale)):
+            v = pyro.sample("v", unit.expand([len(scale), len(view.factor)]).to_event(1))
+            pyro.deterministic("u", scale * (v @ view.factor.mT), event_dim=1)
+            law = dist.Normal(scale * (v @ view.projection), scale * view.diagonal.sqrt())
+            with pyro.poutine.scale(scale=batch.total / len(batch)):
+                site = law.mask(view.mask).to_event(1)
+                y: Tensor = pyro.sample("y", site, obs=batch.given(view.y))
+                if self.config.bound == "vfe":
+                    trace = (view.left * view.mask).sum(-1) / (2 * self.noise)
+                    pyro.factor("trace", -trace)
+        return y
+
+    def posterior_sites(self, batch: Batch) -> Sites:
+        """The best q(v) of all items: p(v | y) of FITC, the optimum of VFE's bound."""
+        if len(batch) != batch.total:
+            raise ValueError(f"q(u) needs all {batch.total} items at once; got {len(batch)}")
+        view = self._view(batch)
+        y = view.y / self.signal.sqrt()[:, None]
+        mean, root = white_posterior(view.projection, view.mask / view.diagonal, y)
+        v = dist.MultivariateNormal(mean, scale_tril=root)
+        return Sites(plate="targets", size=len(y), rows=len(y), of={"v": lambda _: v})
 
     def report(self) -> dict[str, Any]:
         """Hyperparameters in the model's scale, and the noise that the other bound found."""
@@ -224,6 +199,28 @@ class SparseGaussianProcess(nn.Module):
             "noise_std_vfe": self.other_noise.tolist(),
         }
 
+    def _begin(self, data: Sequences | Pairs) -> Pairs:
+        """Draw inducing inputs; start at their median distance and the configured noise."""
+        data = pairs_of(data)
+        known = data.mask.any(1).nonzero()[:, 0]
+        order = torch.randperm(len(known), device=known.device)[: self.config.count(len(known))]
+        self._set_inducing(data.inputs[known[order]].to(self.dtype))
+        inducing = self.inducing.detach()
+        among = squared_distances(inducing, inducing).fill_diagonal_(0)
+        with torch.no_grad():
+            self.log_length.fill_(median_distance(among).log())
+            self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
+        return data
+
+    def _view(self, batch: Batch) -> View:
+        if self.inducing.numel() == 0:
+            raise NotFittedError("there are no inducing inputs yet; call zoo.fit first")
+        if batch.inputs is None:
+            raise ValueError("a Gaussian process needs items with inputs; got none")
+        k_uu = self._jittered(self._kernel(self.inducing, self.inducing))
+        k_uf = self._kernel(self.inducing, batch.inputs.flatten(1))
+        return View.of(batch, k_uu, k_uf, self.noise, self.config.bound)
+
     def _set_inducing(self, inputs: Tensor) -> None:
         if self.config.learn_inducing:
             self.inducing = nn.Parameter(inputs.clone())
@@ -236,12 +233,12 @@ class SparseGaussianProcess(nn.Module):
         among = squared_distances(inducing, inducing)
         return among.fill_diagonal_(0), squared_distances(inputs, inducing)
 
-    def _need_training(self) -> _Training:
+    def _need_training(self) -> Training:
         if self._training is None:
             raise RuntimeError("the evidence needs training data; call condition(data) first")
         return self._training
 
-    def _geometry(self, training: _Training) -> tuple[Tensor, Tensor, Tensor]:
+    def _geometry(self, training: Training) -> tuple[Tensor, Tensor, Tensor]:
         """K_uu with its jitter, and the distances to all inputs with the length they are over."""
         if self.config.learn_inducing or self.config.ard:
             k_uu = self._kernel(self.inducing, self.inducing)
@@ -259,19 +256,18 @@ class SparseGaussianProcess(nn.Module):
         return squared_exponential(distances, distances.new_zeros(()))
 
     @torch.no_grad()
-    def _keep_posterior(self, training: _Training) -> None:
+    def _keep_posterior(self, training: Training) -> None:
         bound = training.bound
         k_uu, across, log_length = self._geometry(training)
         self.factor = torch.linalg.cholesky(k_uu)
         found = bound.posteriors(bound.project(self.factor, across, log_length), self.noise)
         count = bound.targets.shape[1]
-        self.signal, self.pattern = k_uu.new_zeros(count), k_uu.new_zeros(count)
-        self.mean = k_uu.new_zeros(len(k_uu), count)
+        self.pattern, self.mean = k_uu.new_zeros(count), k_uu.new_zeros(len(k_uu), count)
         for i, (q, (observed, targets)) in enumerate(zip(found, bound.groups, strict=True)):
             which = list(targets)
-            self.signal[which], self.mean[:, which] = q.quadratic / observed.sum(), q.mean
-            self.pattern[which] = float(i)
-        self.information = torch.stack([q.factor for q in found])
+            self.log_signal[which] = (q.quadratic / observed.sum()).log()
+            self.mean[:, which], self.pattern[which] = q.mean, float(i)
+        self.root = torch.stack([q.factor.inverse().mT for q in found])
 
     def _fixed(self, bound: Literal["fitc", "vfe"], **changes: Any) -> SparseGaussianProcess:
         """The same data and inducing inputs, these held still, optimised from here."""
@@ -283,7 +279,7 @@ class SparseGaussianProcess(nn.Module):
         if self.config.learn_inducing:
             among, across = other._distances(training.inputs)
         targets, groups = training.bound.targets, training.bound.groups
-        other._training = _Training(
+        other._training = Training(
             training.inputs, Collapsed(targets, groups, bound), among, across
         )
         with torch.no_grad():
