@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from zoo.datasets.records import Pairs, Sequences
     from zoo.ensemble import Ensemble, fit_ensemble
     from zoo.evaluation.table import Table
+    from zoo.fitting import fit
     from zoo.player import play
     from zoo.prediction import Prediction
-    from zoo.run import Run, create, evaluate, fit, load
+    from zoo.run import Run, create, evaluate, load
 
 __version__ = "0.1.0"
 
@@ -51,7 +52,7 @@ _HOME = {
     "card": "zoo.cards",
     "create": "zoo.run",
     "evaluate": "zoo.run",
-    "fit": "zoo.run",
+    "fit": "zoo.fitting",
     "fit_ensemble": "zoo.ensemble",
     "list_data": "zoo.datasets.library",
     "list_models": "zoo.catalogue",

@@ -295,7 +295,7 @@ def _warn(message: Warning | str, *_: object) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; what the user can mend is one line on stderr, not a traceback."""
-    from zoo.errors import DamagedRunError, TrainingError
+    from zoo.errors import DamagedRunError, RunLockedError, TrainingError
 
     try:
         with warnings.catch_warnings():
@@ -303,7 +303,7 @@ def main(arguments: list[str] | None = None) -> int:
             app(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)
-    except (DamagedRunError, TrainingError, OSError, FloatingPointError) as error:
+    except (DamagedRunError, TrainingError, RunLockedError, OSError, FloatingPointError) as error:
         print(f"zoo: {error}", file=sys.stderr)
         return 1
     except (ValueError, TypeError, LookupError) as error:

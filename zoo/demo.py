@@ -11,7 +11,8 @@ from rich.console import Console
 
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
-from zoo.run import create, evaluate, fit
+from zoo.fitting import fit
+from zoo.run import create, evaluate
 from zoo.workflow import forecast_figure, reliability_figure
 
 __all__ = ["main"]
@@ -44,7 +45,7 @@ def main(folder: Path = Path("demo")) -> int:
         f"{len(val)} to validate, {len(calib)} to calibrate, {len(test)} never seen"
     )
     assembly = create("vae-dmp", train, max_steps=STEPS)
-    run = fit(assembly, train, val=val, run_dir=folder / "run", progress=True)
+    run = fit(assembly, train, val=val, run_dir=folder / "run", overwrite=True, progress=True)
     run.calibrate(calib)
     run.save(folder / "run")
     table = evaluate(run, test, tasks=["forecast", "reconstruct"])

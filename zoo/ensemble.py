@@ -17,9 +17,11 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.calibration import recalibration_from_state
 from zoo.exchange import check_unseen, question
+from zoo.fitting import fit
 from zoo.mixtures import pooled
 from zoo.prediction import Prediction, Recalibration
-from zoo.run import Resume, Run, fit
+from zoo.run import Run
+from zoo.rundir import Resume
 from zoo.storage import load_run
 from zoo.tasks import Method, Setup, corrections
 
@@ -150,11 +152,14 @@ class Ensemble:
         self.recalibrations.update(corrections(self, data, method, tasks, setup))
         return self
 
-    def save(self, folder: str | Path) -> Path:
-        """Write the members and the ensemble's calibration as folders of safetensors and JSON."""
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the members and the ensemble's calibration as folders of safetensors and JSON.
+
+        Members of another training are replaced only with ``overwrite``, as :meth:`zoo.Run.save`.
+        """
         folder, tensors, states = Path(folder), dict[str, Tensor](), dict[str, Any]()
         for i, run in enumerate(self.members):
-            run.save(folder / f"member-{i}")
+            run.save(folder / f"member-{i}", overwrite=overwrite)
         for task, recalibration in self.recalibrations.items():
             states[task], extra = recalibration.state()
             tensors.update({f"{task}.{k}": v for k, v in extra.items()})
@@ -203,9 +208,12 @@ def fit_ensemble(
     val: Pairs | Sequences | None = None,
     run_dir: str | Path | None = None,
     resume: Resume = "never",
+    overwrite: bool = False,
     progress: bool = False,
 ) -> Ensemble:
     """Train every member on ``train``, each in a folder of its own below ``run_dir``.
+
+    ``resume`` and ``overwrite`` are those of :func:`zoo.fit`, for every member.
 
     >>> import numpy as np, zoo
     >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
@@ -213,13 +221,20 @@ def fit_ensemble(
     >>> zoo.fit_ensemble(members, data).name
     'ensemble of vae'
     """
-    folders = [
-        None if run_dir is None else Path(run_dir) / f"member-{i}" for i in range(len(assemblies))
-    ]
+    if run_dir is not None and overwrite:
+        archive.clear(Path(run_dir), "ensemble")
     return Ensemble(
         members=tuple(
-            fit(a, train, val=val, run_dir=folder, resume=resume, progress=progress)
-            for a, folder in zip(assemblies, folders, strict=True)
+            fit(
+                assembly,
+                train,
+                val=val,
+                run_dir=None if run_dir is None else Path(run_dir) / f"member-{i}",
+                resume=resume,
+                overwrite=overwrite,
+                progress=progress,
+            )
+            for i, assembly in enumerate(assemblies)
         )
     )
 

@@ -9,7 +9,10 @@ __all__ = [
     "NoiseDivergenceWarning",
     "NotCapableError",
     "NotFittedError",
+    "OtherTrainingError",
     "PosteriorCollapseWarning",
+    "RunExistsError",
+    "RunLockedError",
     "TooManyItemsError",
     "TrainingError",
     "TrainingWarning",
@@ -55,6 +58,18 @@ class TooManyItemsError(ValueError):
 
 class FewerInducingWarning(UserWarning):
     """A fraction of the items would be more inducing inputs than pay off; fewer were taken."""
+
+
+class OtherTrainingError(ValueError):
+    """A folder holds another training than the one at hand; the message says what differs."""
+
+
+class RunExistsError(ValueError):
+    """A folder holds a run or a begun training, which nothing replaces unasked."""
+
+
+class RunLockedError(RuntimeError):
+    """Another process is writing in the folder."""
 
 
 class TrainingError(RuntimeError):

@@ -1,13 +1,11 @@
-"""A trained model with everything it needs to predict: fit, predict, calibrate, save and load."""
+"""A trained model with everything it needs to predict: predict, calibrate, save and load."""
 
 from __future__ import annotations
 
-import copy
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -19,17 +17,14 @@ from zoo.datasets.scaling import Scaler
 from zoo.errors import NotCapableError
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
-from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
+from zoo.exchange import Answer, Exchange, check_timing, check_unseen, question
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
-from zoo.inference.train import Session, train_model
 from zoo.prediction import Prediction, Predictive, Recalibration
 from zoo.tasks import Method, Setup, Trained, corrections, trials
 from zoo.types import Batch, Posterior
 
-__all__ = ["Run", "create", "evaluate", "fit", "load"]
-
-Resume = Literal["never", "auto", "must"]
+__all__ = ["Run", "create", "evaluate", "load"]
 
 
 @dataclass(kw_only=True)
@@ -37,7 +32,9 @@ class Run:
     """A trained model: predictions in the data's own units, calibration, saving.
 
     ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
-    ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed.
+    ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed;
+    ``made_of`` all that determined it (:mod:`zoo.fingerprint`), empty where it was trained without
+    a folder; ``seconds`` the wall clock of its training.
     """
 
     assembly: Assembly
@@ -45,6 +42,7 @@ class Run:
     history: list[dict[str, Any]]
     seconds: float
     trained_on: dict[str, Any]
+    made_of: dict[str, str] = field(default_factory=dict)
     recalibrations: dict[str, Recalibration] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -190,11 +188,17 @@ class Run:
         """
         return self.exchange.report()
 
-    def save(self, folder: str | Path) -> Path:
-        """Write the run as a folder of safetensors and JSON."""
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the run as a folder of safetensors and JSON.
+
+        Another run there is replaced only with ``overwrite``, else RunExistsError is raised; the
+        same training with a newer calibration always is.
+        """
+        from zoo.lock import free
         from zoo.storage import save_run
 
-        return save_run(self, Path(folder))
+        with free(Path(folder)):
+            return save_run(self, Path(folder), overwrite=overwrite)
 
     def _capability(self, task: str) -> Callable[..., Predictive]:
         if task not in self.capabilities:
@@ -226,61 +230,6 @@ class Run:
             lengths=frames,
             recalibration=self.recalibrations.get(question(task, data)),
         )
-
-
-def fit(
-    assembly: Assembly,
-    train: Pairs | Sequences,
-    *,
-    val: Pairs | Sequences | None = None,
-    run_dir: str | Path | None = None,
-    resume: Resume = "never",
-    progress: bool = False,
-    tensorboard: bool = False,
-) -> Run:
-    """Train what :func:`zoo.create` bound together; the assembly itself stays untouched.
-
-    With ``run_dir`` the training writes checkpoints and, at its end, the run; ``resume="auto"``
-    continues from a checkpoint found there and gives the same bits as an uninterrupted run.
-
-    >>> import numpy as np, zoo
-    >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
-    >>> run = zoo.fit(zoo.create("pca", data, latent_dim=2), data)
-    >>> run.reconstruct(data).shape
-    (4, 20, 3)
-    """
-    for part in (train, val):
-        if part is not None:
-            assembly.layout.check(part.layout)
-    began = time.monotonic()
-    scaler = Scaler.fit(train, assembly.scaling)
-    model, guide = copy.deepcopy((assembly.model, assembly.guide))
-    trained = replace(assembly, model=model, guide=guide)
-    folder = None if run_dir is None else Path(run_dir)
-
-    def prepared(data: Any) -> Any:
-        return scaler.apply(data).to(dtype=assembly.dtype, device=assembly.device)
-
-    session = Session(
-        seed=assembly.seed,
-        device=assembly.device,
-        folder=folder,
-        resume=resume,
-        progress=progress,
-        tensorboard=tensorboard,
-    )
-    held_out = None if val is None else prepared(val)
-    history = train_model(model, guide, assembly.inference, prepared(train), held_out, session)
-    run = Run(
-        assembly=trained,
-        scaler=scaler,
-        history=history,
-        seconds=time.monotonic() - began,
-        trained_on={"name": train.name, "fingerprints": fingerprints(train)},
-    )
-    if folder is not None:
-        run.save(folder)
-    return run
 
 
 def evaluate(

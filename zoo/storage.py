@@ -9,6 +9,7 @@ from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
 
+import torch
 from pydantic import TypeAdapter
 from torch import Tensor
 
@@ -17,14 +18,14 @@ from zoo import archive
 from zoo.assembly import assemble
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.scaling import Scaler
-from zoo.errors import DamagedRunError
+from zoo.errors import DamagedRunError, RunExistsError
 from zoo.evaluation.calibration import recalibration_from_state
 from zoo.run import Run
 from zoo.types import Layout
 
-__all__ = ["FORMAT_VERSION", "load_run", "save_run"]
+__all__ = ["FORMAT_VERSION", "load_run", "made_of_run", "save_run"]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _LIBRARIES = ("torch", "pyro-ppl", "gpytorch", "numpy")
 
 
@@ -46,14 +47,21 @@ class _Index:
     seconds: float
     history: list[dict[str, Any]]
     trained_on: _TrainedOn
+    made_of: dict[str, str]
     recalibrations: dict[str, dict[str, Any]]
     versions: dict[str, str]
 
 
-def save_run(run: Run, folder: Path) -> Path:
-    """Write a run so that :func:`load_run` gives back the same predictions, bit for bit."""
+def save_run(run: Run, folder: Path, *, overwrite: bool = False) -> Path:
+    """Write a run so that :func:`load_run` gives back the same predictions, bit for bit.
+
+    Another run in ``folder`` is replaced only where ``overwrite`` says so; the same training, with
+    whatever calibration, is.
+    """
     assembly = run.assembly
     tensors: dict[str, Tensor] = archive.state_of(model=assembly.model, guide=assembly.guide)
+    if archive.exists(folder, "run") and not overwrite:
+        _check_same(folder, run, tensors)
     corrections: dict[str, Any] = {}
     for task, recalibration in run.recalibrations.items():
         corrections[task], extra = recalibration.state()
@@ -67,6 +75,7 @@ def save_run(run: Run, folder: Path) -> Path:
         "seconds": run.seconds,
         "history": [_finite(row) for row in run.history],
         "trained_on": run.trained_on,
+        "made_of": run.made_of,
         "recalibrations": corrections,
         "versions": {"movezoo": zoo.__version__, **{n: installed(n) for n in _LIBRARIES}},
     }
@@ -85,6 +94,32 @@ def load_run(folder: Path, *, device: str = "cpu") -> Run:
         raise DamagedRunError(f"{folder}/run.json does not describe a run: {error}") from error
 
 
+def made_of_run(folder: Path) -> dict[str, str]:
+    """The fingerprint of a saved run; empty where it was trained without a folder."""
+    found: dict[str, str] = archive.read(folder, "run", version=FORMAT_VERSION)[0]["made_of"]
+    return found
+
+
+def _check_same(folder: Path, run: Run, tensors: dict[str, Tensor]) -> None:
+    """Refuse to replace a run whose training was another."""
+    try:
+        meta, kept = archive.read(folder, "run", version=FORMAT_VERSION)
+    except DamagedRunError as error:
+        raise RunExistsError(f"{error}; save(..., overwrite=True) replaces it") from None
+    same = meta["entry"] == run.name and set(tensors) == {
+        k for k in kept if not k.startswith("recalibration.")
+    }
+    if not (same and all(_equal(v, kept[k]) for k, v in tensors.items())):
+        raise RunExistsError(
+            f"{folder} holds another run, of {meta['entry']} on {meta['trained_on']['name']!r}: "
+            "take another folder, or save(..., overwrite=True) to replace it"
+        )
+
+
+def _equal(one: Tensor, other: Tensor) -> bool:
+    return one.dtype == other.dtype and torch.equal(one.detach().cpu(), other)
+
+
 def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
     entry, layout = CATALOGUE[index.entry], index.layout
     assembly = assemble(entry, layout, index.settings, seed=index.seed, device=device)
@@ -100,6 +135,7 @@ def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
         history=index.history,
         seconds=index.seconds,
         trained_on=asdict(index.trained_on),
+        made_of=index.made_of,
         recalibrations={
             task: recalibration_from_state(state, _part(tensors, f"recalibration.{task}."))
             for task, state in index.recalibrations.items()

@@ -19,8 +19,9 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.answers import clusters
+from zoo.fitting import fit
 from zoo.prediction import Prediction
-from zoo.run import Run, fit, load
+from zoo.run import Run, load
 from zoo.tasks import Setup, beginning, trials
 
 __all__ = ["ForecastReport", "Plan", "forecast_report", "open_run", "reliability_figure", "train"]
@@ -99,27 +100,24 @@ def train(
 ) -> Run:
     """Fit, calibrate and save as planned.
 
-    A folder that holds a training is taken only to ``resume`` it, by the same plan, or to
-    ``overwrite`` it.
+    A folder that holds a training is taken only to ``resume`` the same one, or to ``overwrite``
+    it, see :func:`zoo.fit`.
     """
     train, val, calib, _ = plan.load()
     assembly = create(plan.model, train, seed=plan.seed, device=plan.device, **plan.settings)
-    _check_free(folder, plan, resume, overwrite)
-    folder.mkdir(parents=True, exist_ok=True)
-    if not resume:
-        archive.clear(folder, "run")
-    archive.replace_file(folder / _PLAN, json.dumps(asdict(plan), indent=1).encode())
     run = fit(
         assembly,
         train,
         val=val,
         run_dir=folder,
         resume="auto" if resume else "never",
+        overwrite=overwrite,
         progress=progress,
     )
+    archive.replace_file(folder / _PLAN, json.dumps(asdict(plan), indent=1).encode())
     if plan.calibrate != "none" and _enough(calib):
         run.calibrate(calib, method=plan.calibrate)  # type: ignore[arg-type]
-        run.save(folder)
+    run.save(folder)
     return run
 
 
@@ -132,26 +130,6 @@ def _enough(calib: Pairs | Sequences) -> bool:
             stacklevel=3,
         )
     return count >= 2
-
-
-def _check_free(folder: Path, plan: Plan, resume: bool, overwrite: bool) -> None:
-    if overwrite and resume:
-        raise ValueError("--resume goes on with a training, --overwrite replaces it: choose one")
-    if overwrite:
-        return
-    if not resume and any(archive.exists(folder, stem) for stem in ("run", "checkpoint")):
-        raise ValueError(
-            f"{folder} holds a training already: --resume to go on with it, --overwrite to replace "
-            "it, or another --run-dir"
-        )
-    kept = Plan.kept(folder) if resume else None
-    for name in ("model", "data", "settings", "by", "parts", "seed"):
-        was, new = getattr(kept, name, None), getattr(plan, name)
-        if kept is not None and was != new:
-            raise ValueError(
-                f"{folder} was begun with {name} {was!r}, now it is {new!r}: repeat its own words, "
-                "or choose another --run-dir"
-            )
 
 
 def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:

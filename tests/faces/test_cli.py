@@ -137,9 +137,9 @@ def test_a_folder_is_not_overwritten_by_accident(
     assert main(words) == 2
     assert "--resume" in capsys.readouterr().err
     assert main([*words, "--resume", "--set", "kernels=7"]) == 2
-    assert "begun with settings {}" in capsys.readouterr().err
+    assert "kernels of the model was 20 and is 7 now" in capsys.readouterr().err
     assert main(["fit", "mean", *words[2:], "--resume"]) == 2
-    assert "begun with model 'dmp'" in capsys.readouterr().err
+    assert "entry was dmp and is mean now" in capsys.readouterr().err
     assert main([*words, "--resume", "--overwrite"]) == 2
     assert {f.name: f.read_bytes() for f in run_folder.iterdir()} == before
 

@@ -75,13 +75,13 @@ def test_a_crash_while_saving_leaves_the_old_run_or_the_new(
         folder = run.save(tmp_path / f"{step}{call}")
         _crash(monkeypatch, step, call)
         try:
-            new.save(folder)
+            new.save(folder, overwrite=True)
         except OSError:
             crashes += 1
         finally:
             monkeypatch.undo()
         assert any(torch.equal(zoo.load(folder).model.mean, m) for m in means)
-        new.save(folder)
+        new.save(folder, overwrite=True)
         assert torch.equal(zoo.load(folder).model.mean, means[1])
         assert len(list(folder.iterdir())) == 2
     assert crashes

@@ -14,7 +14,8 @@ from scipy.signal import find_peaks
 
 from zoo.datasets.cmu_mocap import load
 from zoo.datasets.records import Sequences
-from zoo.run import Run, create, fit
+from zoo.fitting import fit
+from zoo.run import Run, create
 from zoo.strategies import Svi
 
 __all__ = ["DATA", "FRAMES", "both", "fitted", "jogging", "mse", "walking", "without"]

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments.result import Result
-from zoo.run import Run, create, fit
+from zoo.fitting import fit
+from zoo.run import Run, create
 from zoo.strategies import Svi
 
 if TYPE_CHECKING:

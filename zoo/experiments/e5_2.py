@@ -14,7 +14,8 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments import e5_1
 from zoo.experiments.result import Result
-from zoo.run import Run, create, fit
+from zoo.fitting import fit
+from zoo.run import Run, create
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

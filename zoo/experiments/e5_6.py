@@ -14,9 +14,10 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments import e5_1
 from zoo.experiments.result import Result
+from zoo.fitting import fit
 from zoo.player import posture_strips
 from zoo.prediction import Prediction
-from zoo.run import Run, create, fit
+from zoo.run import Run, create
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,10 +13,11 @@ from torch import Tensor
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments.result import Result
+from zoo.fitting import fit
 from zoo.nn.metric import sensitivity
 from zoo.player import posture_map
 from zoo.prediction import Predictive
-from zoo.run import Run, create, fit
+from zoo.run import Run, create
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from zoo.datasets.records import Sequences
 from zoo.datasets.robot_arm import end_effector, load, load_held_out
 from zoo.experiments.result import Result
+from zoo.fitting import fit
 from zoo.prediction import Prediction
-from zoo.run import Run, create, fit
+from zoo.run import Run, create
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,6 +16,7 @@ __all__ = ["capture", "clear", "difference", "exists", "read", "restore", "write
 
 VERSION = 1
 _STEM = "checkpoint"
+_MOST = 3
 
 Tensors = dict[str, Tensor]
 
@@ -42,16 +43,29 @@ def clear(folder: Path) -> None:
 
 
 def difference(saved: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """The first setting in which a saved training differs from the one at hand.
+    """In what a saved training differs from the one at hand, in words; None where in nothing.
+
+    The first three differences are told, and how many more there are. Values that begin with #
+    are digests.
 
     >>> difference({"seed": 0, "epochs": 5}, {"seed": 1, "epochs": 5})
     'seed was 0 and is 1 now'
+    >>> difference({"code of zoo.models.vae": "#1"}, {"code of zoo.models.vae": "#2"})
+    'code of zoo.models.vae changed'
     """
-    for key in sorted({*saved, *now}):
-        was, new = saved.get(key), now.get(key)
-        if was != new:
-            return f"{key} was {was} and is {new} now"
-    return None
+    found = [_told(k, saved, now) for k in {**now, **saved} if saved.get(k) != now.get(k)]
+    more = f", and {len(found) - _MOST} more" if len(found) > _MOST else ""
+    return "; ".join(found[:_MOST]) + more if found else None
+
+
+def _told(key: str, saved: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    if key not in saved:
+        return f"{key} was not there"
+    if key not in now:
+        return f"{key} is there no more"
+    if str(now[key]).startswith("#"):
+        return f"{key} changed"
+    return f"{key} was {saved[key]} and is {now[key]} now"
 
 
 def capture(prefix: str, part: nn.Module | torch.optim.Optimizer) -> Tensors:

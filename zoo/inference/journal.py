@@ -19,10 +19,20 @@ import numpy as np
 from zoo.errors import DamagedRunError
 from zoo.inference.minimise import Evaluate, Vector
 
-__all__ = ["Journal"]
+__all__ = ["Journal", "clear", "exists"]
 
 _NAME = "evaluations.jsonl"
 _HEAD = {"format": "movezoo-evaluations", "version": 1}
+
+
+def exists(folder: Path) -> bool:
+    """Whether ``folder`` holds a journal."""
+    return (folder / _NAME).is_file()
+
+
+def clear(folder: Path) -> None:
+    """Remove the journal of ``folder``."""
+    (folder / _NAME).unlink(missing_ok=True)
 
 
 class Journal:

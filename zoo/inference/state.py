@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from zoo.datasets.digest import contents
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import DamagedRunError
+from zoo.errors import OtherTrainingError
 from zoo.inference import checkpoint
 from zoo.inference.history import History
 from zoo.strategies import Svi
 
-__all__ = ["FIGURES", "Best", "Parts", "Place", "State", "fingerprint"]
+__all__ = ["FIGURES", "FREE", "Best", "Parts", "Place", "State", "fingerprint"]
 
 FIGURES = ("loss", "reconstruction", "kl", "grad_norm")
-_FREE = ("checkpoint_every",)
+FREE = ("checkpoint_every",)
 
 Tensors = dict[str, Tensor]
 
@@ -114,9 +114,8 @@ class State:
         """Read a checkpoint of the same training and put its tensors in place."""
         tensors, meta = checkpoint.read(folder)
         if gap := checkpoint.difference(meta.get("training", {}), training):
-            raise DamagedRunError(
-                f"the checkpoint in {folder} is of another training: {gap} "
-                "(choose another folder, or resume='never' to start anew)"
+            raise OtherTrainingError(
+                f"the checkpoint in {folder} is of another training: {gap} (take another folder)"
             )
         parts.put(_group("now", tensors))
         torch.set_rng_state(tensors["rng"])
@@ -138,21 +137,13 @@ def fingerprint(
     seed: int,
     **data: Sequences | Pairs | None,
 ) -> dict[str, Any]:
-    """What decides the bits of a training: settings, seed, shapes and data."""
-    settings = {f"strategy.{k}": v for k, v in asdict(strategy).items() if k not in _FREE}
+    """What a checkpoint is compared by: strategy, seed, shapes and data."""
+    settings = {k: v for k, v in asdict(strategy).items() if k not in FREE}
     shapes = {f"shape of {n}": list(p.shape) for n, p in parameters.items()}
-    digests = {f"{n} data": None if d is None else _digest(d) for n, d in data.items()}
-    return {"seed": seed, **settings, **shapes, **digests}
-
-
-def _digest(data: Sequences | Pairs) -> str:
-    total = hashlib.sha256()
-    for entry in fields(data):
-        value = getattr(data, entry.name)
-        if isinstance(value, Tensor):
-            total.update(f"{entry.name} {value.dtype} {tuple(value.shape)}".encode())
-            total.update(value.cpu().contiguous().numpy().tobytes())
-    return total.hexdigest()
+    found = {"seed": seed, **settings, **shapes}
+    for role, record in data.items():
+        found |= contents(record, role)
+    return found
 
 
 def _place(kept: dict[str, Any]) -> Place:

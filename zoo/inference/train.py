@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -66,12 +66,14 @@ class LearnsPrior(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Session:
-    """How a training is run: seed, device, where its checkpoints are, and what it shows."""
+    """How a training is run: seed, device, where its checkpoints are, and what it shows.
+
+    A training that was begun in ``folder`` is gone on with.
+    """
 
     seed: int = 0
     device: str = "cpu"
     folder: Path | None = None
-    resume: Literal["never", "auto", "must"] = "never"
     progress: bool = False
     tensorboard: bool = False
 
@@ -123,7 +125,7 @@ def _marginal(
         seed=session.seed,
         progress=session.progress,
         folder=session.folder,
-        resume=session.resume,
+        resume="auto",
     )
 
 
@@ -144,7 +146,7 @@ def _variational(
         seed=session.seed,
         device=session.device,
         folder=session.folder,
-        resume=session.resume,
+        resume="auto",
         progress=session.progress,
         tensorboard=session.tensorboard,
     )

@@ -21,9 +21,11 @@ from zoo import archive
 from zoo.datasets.records import Sequences
 from zoo.ensemble import Ensemble
 from zoo.errors import DamagedRunError
+from zoo.fitting import fit
 from zoo.leaderboard.protocols import PROTOCOLS, Protocol
 from zoo.prediction import Prediction, Predictive
-from zoo.run import Resume, Run, create, fit, load
+from zoo.run import Run, create, load
+from zoo.rundir import Resume
 from zoo.strategies import Svi
 
 __all__ = ["Cell", "Found", "compute", "compute_all"]

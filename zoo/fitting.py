@@ -1,0 +1,86 @@
+"""``zoo.fit``: a training, or the finished one that a folder holds."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from zoo.assembly import Assembly
+from zoo.datasets.records import Pairs, Sequences
+from zoo.exchange import fingerprints
+from zoo.fingerprint import fingerprint
+from zoo.inference.train import Session
+from zoo.run import Run
+from zoo.rundir import Resume, claimed
+from zoo.storage import load_run, save_run
+from zoo.training import learn
+
+__all__ = ["fit"]
+
+
+def fit(
+    assembly: Assembly,
+    train: Pairs | Sequences,
+    *,
+    val: Pairs | Sequences | None = None,
+    run_dir: str | Path | None = None,
+    resume: Resume = "never",
+    overwrite: bool = False,
+    progress: bool = False,
+    tensorboard: bool = False,
+) -> Run:
+    """Train what :func:`zoo.create` bound together; the assembly itself stays untouched.
+
+    With ``run_dir`` the training writes checkpoints and, at its end, the run. What the folder
+    holds already is never replaced unasked: ``resume="auto"`` goes on with a begun training and
+    gives the same bits as an uninterrupted one, or returns the finished run (without the
+    calibration it may have been saved with: :func:`zoo.load` has that); ``"must"`` does so and
+    starts none anew; ``overwrite=True`` replaces it. Both compare all that determines the result:
+    entry, settings, seed, data, libraries and the code of model, guide and training.
+
+    Raises OtherTrainingError, which names what differs, RunExistsError where the folder is taken
+    and neither was asked for, RunLockedError where another process trains in it, and
+    FileNotFoundError where ``resume="must"`` finds nothing.
+
+    >>> import numpy as np, zoo
+    >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
+    >>> run = zoo.fit(zoo.create("pca", data, latent_dim=2), data)
+    >>> run.reconstruct(data).shape
+    (4, 20, 3)
+    """
+    for part in (train, val):
+        if part is not None:
+            assembly.layout.check(part.layout)
+    session = Session(
+        seed=assembly.seed, device=assembly.device, progress=progress, tensorboard=tensorboard
+    )
+    if run_dir is None:
+        return _fitted(assembly, train, val, session, {})
+    folder, made_of = Path(run_dir), fingerprint(assembly, train, val)
+    with claimed(folder, made_of, resume, overwrite) as finished:
+        if finished:
+            return replace(load_run(folder, device=assembly.device), recalibrations={})
+        run = _fitted(assembly, train, val, replace(session, folder=folder), made_of)
+        save_run(run, folder)
+    return run
+
+
+def _fitted(
+    assembly: Assembly,
+    train: Pairs | Sequences,
+    val: Pairs | Sequences | None,
+    session: Session,
+    made_of: dict[str, str],
+) -> Run:
+    began = time.monotonic()
+    learned = learn(assembly, train, val, session)
+    epochs = sum(row.get("seconds", 0.0) for row in learned.history)
+    return Run(
+        assembly=learned.assembly,
+        scaler=learned.scaler,
+        history=learned.history,
+        seconds=max(epochs, time.monotonic() - began),
+        trained_on={"name": train.name, "fingerprints": fingerprints(train)},
+        made_of=made_of,
+    )
