@@ -158,6 +158,7 @@ class Sequences:
             input_units=self.control_units,
             rate=None if self.time_normalised else self.rate,
             frames=int(self.lengths[0]) if equal else None,
+            windows="start" in self.groups,
         )
 
     @property

@@ -17,6 +17,7 @@ from zoo.prediction import Predictive
 from zoo.types import Batch, Posterior
 
 __all__ = [
+    "FollowsPhase",
     "Forecasts",
     "Generates",
     "Imputes",
@@ -108,4 +109,14 @@ class Reports(Protocol):
         Those with ``_std`` in their name hold a standard deviation for each target or channel; the
         run brings them to the data's units.
         """
+        ...
+
+
+@runtime_checkable
+class FollowsPhase(Protocol):
+    """A model of movements that begin at their first frame and end at their last, if ``phased``."""
+
+    @property
+    def phased(self) -> bool:
+        """Whether where a movement begins matters."""
         ...

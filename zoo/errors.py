@@ -3,6 +3,7 @@
 __all__ = [
     "DamagedRunError",
     "FewerInducingWarning",
+    "MovementLengthError",
     "NoDensityError",
     "NoJointSamplesError",
     "NoSpreadError",
@@ -18,6 +19,7 @@ __all__ = [
     "TrainingWarning",
     "UnknownNameError",
     "UnlikeUnitsWarning",
+    "WindowsWarning",
 ]
 
 
@@ -72,6 +74,10 @@ class RunLockedError(RuntimeError):
     """Another process is writing in the folder."""
 
 
+class MovementLengthError(ValueError):
+    """Movements are longer or shorter than those that a model can answer for."""
+
+
 class TrainingError(RuntimeError):
     """Training failed for good; the message names site and step and what to try."""
 
@@ -90,3 +96,7 @@ class PosteriorCollapseWarning(UserWarning):
 
 class UnlikeUnitsWarning(UserWarning):
     """Channels of several units are scaled by one number."""
+
+
+class WindowsWarning(UserWarning):
+    """Windows are given to a model of whole movements, or whole movements to one of windows."""

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from zoo.assembly import Assembly
-from zoo.capabilities import Reports
+from zoo.capabilities import FollowsPhase, Reports
 from zoo.datasets.records import Pairs, Sequences
 from zoo.datasets.scaling import Scaler
+from zoo.errors import WindowsWarning
 from zoo.inference.loader import whole
 from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.prediction import Predictive
@@ -57,6 +58,9 @@ class Exchange:
             raise TypeError(
                 f"{self.assembly.entry.name} predicts Sequences; got {type(data).__name__}"
             )
+        model = self.assembly.model
+        if isinstance(model, FollowsPhase) and model.phased:
+            _check_begin(self.assembly, data)
         scaled: Sequences = self.scaled(data)
         return scaled
 
@@ -156,6 +160,28 @@ def check_timing(like: Sequences, duration: float, switches: bool, start: int, s
     if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
         raise ValueError(
             f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
+        )
+
+
+def _check_begin(assembly: Assembly, data: Sequences) -> None:
+    """Warn where movements begin or end elsewhere than those trained on."""
+    name, layout = assembly.entry.name, assembly.layout
+    longest = int(data.lengths.max())
+    begins = {int(s) for s in data.groups.get("start", ()) if s.isdigit()}
+    if layout.windows and not begins and longest > (layout.frames or longest):
+        warnings.warn(
+            f"{name} was trained on windows of {layout.frames} frames and takes each movement of "
+            f"up to {longest} frames for one of them: cut them by data.windows({layout.frames})",
+            WindowsWarning,
+            stacklevel=5,
+        )
+    if not layout.windows and begins - {0}:
+        warnings.warn(
+            f"{name} was trained on whole movements and takes the first frame of each window for "
+            f"the begin of one; these begin at frame {min(begins - {0})} and later: train it on "
+            "windows too, or give movements from their first frame on",
+            WindowsWarning,
+            stacklevel=5,
         )
 
 

@@ -35,7 +35,11 @@ __all__ = ["Batch", "Layout", "Posterior", "Sites"]
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What a model must know of its data before it sees any: names, units, rate and lengths."""
+    """What a model must know of its data before it sees any: names, units, rate and lengths.
+
+    ``frames`` is the length that all movements have, if any; ``windows`` says that they are cut
+    from longer ones.
+    """
 
     kind: Literal["sequences", "pairs"]
     channels: tuple[str, ...]
@@ -44,6 +48,7 @@ class Layout:
     input_units: tuple[str, ...] = ()
     rate: float | None = None
     frames: int | None = None
+    windows: bool = False
 
     def __post_init__(self) -> None:
         """Refuse labels that do not go together."""

@@ -16,6 +16,7 @@ from zoo.dynamics.components import alike, ramp
 from zoo.dynamics.imitator import Imitator
 from zoo.dynamics.paths import PathPrior, Readout
 from zoo.errors import NotFittedError
+from zoo.models.latent_dmp import check_end, check_whole, common_length
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp, widths
 from zoo.prediction import Predictive
@@ -95,6 +96,8 @@ class AeDmp(nn.Module):
 
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float32
+    label: ClassVar[str] = "ae-dmp"
+    phased: ClassVar[bool] = True
 
     prior_movements: Tensor
     prior_residuals: Tensor
@@ -103,7 +106,8 @@ class AeDmp(nn.Module):
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model of movements of ``layout.frames`` frames, all of one length."""
         super().__init__()
-        self.layout, self.config, self.frames = layout, config, _frames(layout)
+        self.layout, self.config = layout, config
+        self.frames = common_length(self.label, layout)
         self.latent_dim = config.latent_dim
         self.imitator = Imitator(self.frames, config.kernels, config.alpha)
         sizes = [config.latent_dim, *widths(config.hidden)[::-1], len(layout.channels)]
@@ -168,7 +172,7 @@ class AeDmp(nn.Module):
         y, seen = self._encoded(batch, posterior)
         if bool(seen.all()):
             return self._decoded(self._smoothed(y, batch.mask)[None])
-        paths = self._completed(y, seen, self.frames, draws)
+        paths = self._completed(y, seen, y.shape[1], draws)
         return self._decoded(torch.where(seen[..., None], y, paths))
 
     def _smoothed(
@@ -232,7 +236,7 @@ class AeDmp(nn.Module):
     def _prior(self, length: int) -> PathPrior:
         """The mixture over latent paths of ``length`` frames, in float64."""
         if not self.prior_movements.numel():
-            raise NotFittedError("ae-dmp knows no movements yet; train it by zoo.fit first")
+            raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
         θ = self.prior_movements.double()
         size = θ.var(0) if len(θ) > 1 else θ.square().mean((0, 1)).expand_as(θ[0])
         return PathPrior.of_responses(
@@ -252,7 +256,9 @@ class AeDmp(nn.Module):
         draws: int,
     ) -> Float[Tensor, "sample sequence frame latent"]:
         """Draws of paths of ``length`` frames given the latent frames seen."""
-        prior, beyond = self._prior(length), length - y.shape[1]
+        beyond = length - y.shape[1]
+        check_end(self.label, self.frames, y.shape[1], beyond)
+        prior = self._prior(length)
         paths = y.new_empty(draws, len(y), length, self.latent_dim)
         values, where = pad(y.double(), (0, 0, 0, beyond)), pad(seen, (0, beyond))
         for rows, frames in alike(where):
@@ -275,11 +281,7 @@ class AeDmp(nn.Module):
         return _need(posterior).draw(batch, 1)["theta"][0]
 
     def _whole(self, batch: Batch) -> Tensor:
-        if batch.values.shape[1] != self.frames:
-            raise ValueError(
-                f"movements have {batch.values.shape[1]} frames; this model was made for "
-                f"{self.frames}: a part of a movement can be forecast or imputed"
-            )
+        check_whole(self.label, self.frames, batch.values.shape[1])
         return batch.values
 
     def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
@@ -301,15 +303,5 @@ def _steps(mask: Tensor | None) -> Tensor | bool:
 
 def _need(posterior: Posterior | None) -> Posterior:
     if posterior is None:
-        raise TypeError("ae-dmp predicts through its guide; got no posterior")
+        raise TypeError("this model predicts through its guide; got no posterior")
     return posterior
-
-
-def _frames(layout: Layout) -> int:
-    if layout.frames is None or layout.frames < 3:
-        raise ValueError(
-            "ae-dmp needs movements of one common length of at least 3 frames; got "
-            f"{'several lengths' if layout.frames is None else layout.frames}: "
-            "bring them to one by data.resampled(70) or data.windows(70)"
-        )
-    return layout.frames

@@ -117,6 +117,7 @@ class DMP(nn.Module):
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model without data: θ ~ N(0, I)."""
         super().__init__()
+        self.phased = config.kind == "discrete"
         self.layout, self.config = layout, config
         beta = config.alpha / 4 if config.beta is None else config.beta
         self.primitive = Primitive(config.kind, config.kernels, config.alpha, beta, config.gated)

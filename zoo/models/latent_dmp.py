@@ -19,11 +19,12 @@ from zoo.dynamics.dmp import (
     transition_matrix,
 )
 from zoo.dynamics.plan import Plan
+from zoo.errors import MovementLengthError
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp
 from zoo.types import Batch, Layout
 
-__all__ = ["Config", "LatentDmp"]
+__all__ = ["Config", "LatentDmp", "check_end", "check_whole", "common_length"]
 
 ALPHA, ALPHA_FRAME = 25.0, 0.4
 BEYOND = 0.1
@@ -89,6 +90,8 @@ class LatentDmp(nn.Module):
 
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float32
+    label: ClassVar[str] = "vae-dmp"
+    phased: ClassVar[bool] = True
 
     w_noise: Tensor
     basis: Tensor
@@ -98,7 +101,7 @@ class LatentDmp(nn.Module):
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model of movements of ``layout.frames`` frames, all of one length."""
         super().__init__()
-        self.config, self.frames = config, _frames(layout)
+        self.config, self.frames = config, common_length(self.label, layout)
         self.latent_dim, self.kernels = config.latent_dim, config.kernels
         self.goal_scaling = config.goal_scaling
         channels, latent = len(layout.channels), config.latent_dim
@@ -229,11 +232,33 @@ def _system(alpha: float | None, frames: int) -> Transformation:
     return system
 
 
-def _frames(layout: Layout) -> int:
+def common_length(label: str, layout: Layout) -> int:
+    """The one length of all movements, in frames."""
     if layout.frames is None or layout.frames < 3:
-        raise ValueError(
-            "vae-dmp needs movements of one common length of at least 3 frames; got "
+        raise MovementLengthError(
+            f"{label} needs movements of one common length of at least 3 frames; got "
             f"{'several lengths' if layout.frames is None else layout.frames}: "
-            "bring them to one by data.resampled(70) or data.windows(70)"
+            "bring them to n frames by data.resampled(n), or cut them by data.windows(n)"
         )
     return layout.frames
+
+
+def check_whole(label: str, frames: int, given: int) -> None:
+    """Refuse movements that are not as long as those trained on."""
+    if given != frames:
+        raise MovementLengthError(
+            f"movements have {given} frames; this {label} was made for {frames}: a part of a "
+            f"movement can be forecast or imputed, a longer one is cut by data.windows({frames})"
+        )
+
+
+def check_end(label: str, frames: int, given: int, horizon: int) -> None:
+    """Refuse what lies after the end of the movements trained on: nothing is known of it."""
+    if given + horizon > frames:
+        asked = f"{given} frames" if not horizon else f"{horizon} frames after {given}"
+        room = f"forecast at most {frames - given}, or " if horizon and given < frames else ""
+        raise MovementLengthError(
+            f"{label} was trained on movements that end after {frames} frames; got {asked}: {room}"
+            "train on longer movements, or take a model that goes on for any time "
+            "(vae-dmp-rhythmic, dvbf)"
+        )

@@ -73,6 +73,7 @@ class PcaDmp(nn.Module):
         latent = replace(layout, channels=names, units=("",) * len(names))
         self.pca = pca.PCA(layout, config.pca)
         self.dmp = dmp.DMP(latent, config.dmp)
+        self.phased = self.dmp.phased
 
     def condition(self, data: Sequences | Pairs) -> None:
         """Components of all frames, then the primitives of their paths."""

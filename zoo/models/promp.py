@@ -108,6 +108,7 @@ class ProMP(nn.Module):
     def __init__(self, layout: Layout, config: Config) -> None:
         """Placeholders until :meth:`condition`."""
         super().__init__()
+        self.phased = config.kind == "discrete"
         self.layout, self.config = layout, config
         names = ("mean", "root", "noise", "synergies", "offset", "shrinkage", "units", "offsets")
         for name in names:

@@ -16,7 +16,7 @@ from zoo.dynamics.paths import Conditioned, PathPrior, Readout
 from zoo.dynamics.plan import Plan
 from zoo.errors import NotFittedError
 from zoo.inference.laplace import laplace
-from zoo.models.latent_dmp import Config, LatentDmp
+from zoo.models.latent_dmp import Config, LatentDmp, check_end, check_whole
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
@@ -220,11 +220,7 @@ class VaeDmp(LatentDmp):
         return split
 
     def _posterior_paths(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
-        if batch.values.shape[1] != self.frames:
-            raise ValueError(
-                f"movements have {batch.values.shape[1]} frames; this model was made for "
-                f"{self.frames}: a part of a movement can be forecast or imputed"
-            )
+        check_whole(self.label, self.frames, batch.values.shape[1])
         return self._paths(_need(posterior).draw(batch, draws), batch, draws)
 
     def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
@@ -234,7 +230,7 @@ class VaeDmp(LatentDmp):
     def _prior(self, length: int) -> PathPrior:
         """The mixture over latent paths of ``length`` frames, in float64."""
         if not self.prior_movements.numel():
-            raise NotFittedError("vae-dmp knows no movements yet; train it by zoo.fit first")
+            raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
         u, missing = self.prior_movements.double(), length - self.frames
         response = Response.of(self.system, length, torch.float64, u.device)
         force = self.system.stiffness * torch.cat(
@@ -254,7 +250,10 @@ class VaeDmp(LatentDmp):
 
     def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
         """p(z*_{1:length} | frames seen)."""
-        seen, prior = batch.values.shape[1], self._prior(length)
+        seen = batch.values.shape[1]
+        if self.phased:
+            check_end(self.label, self.frames, seen, length - seen)
+        prior = self._prior(length)
         where = torch.arange(length) < seen
         y = self.embed(posterior.encode(batch.values).mean)
         extra = None
@@ -314,5 +313,5 @@ def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
 
 def _need(posterior: Posterior | None) -> Posterior:
     if posterior is None:
-        raise TypeError("vae-dmp predicts through its guide; got no posterior")
+        raise TypeError("this model predicts through its guide; got no posterior")
     return posterior

@@ -73,6 +73,8 @@ class RhythmicVaeDmp(VaeDmp):
     """
 
     config_class: ClassVar[type] = Config
+    label: ClassVar[str] = "vae-dmp-rhythmic"
+    phased: ClassVar[bool] = False
     config: Config
 
     period: Tensor
@@ -154,7 +156,7 @@ class RhythmicVaeDmp(VaeDmp):
     ) -> CyclePrior:
         """The mixture over limit cycles of ``length`` frames, phases and tempos, in float64."""
         if not self.prior_movements.numel():
-            raise NotFittedError("vae-dmp-rhythmic knows no movements yet; zoo.fit comes first")
+            raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
         middle, around = tempos(self.prior_timings[:, 1].double().neg().exp(), grid[1])
         λ = -(middle * around).log()
         φ = torch.arange(grid[0], dtype=torch.float64) * (2 * math.pi / grid[0])
