@@ -117,6 +117,23 @@ def test_a_repeated_command_takes_what_was_found(tiny: Protocol, tmp_path: Path)
     assert len(list((tmp_path / "cells").rglob("cell.json"))) == 2 * len(stamps)
 
 
+def test_cells_are_kept_by_data_and_code(
+    tiny: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Same name, other values: all anew. Other code of the question: answers alone are anew."""
+    cell = Cell(protocol="tiny", model="mean", settings=((),), seed=0, fold=0, rows=(0,))
+    first = cells.compute(cell, tmp_path, tiny)
+    again = cells.compute(cell, tmp_path, tiny)
+    assert (first.reused, again.reused) == ("", "answer") and again.seconds == first.seconds
+    louder = replace(movements(), values=2 * movements().values)
+    other = cells.compute(cell, tmp_path, replace(tiny, load=lambda: louder))
+    assert other.reused == "" and not torch.equal(other.prediction.mean, first.prediction.mean)
+    monkeypatch.setattr(cells, "code", lambda roots: {"code of zoo.tasks": "#other"})
+    assert cells.compute(cell, tmp_path, tiny).reused == "training"
+    monkeypatch.setattr("zoo.fingerprint.hashes", lambda roots: {"zoo.models.mean": "other"})
+    assert cells.compute(cell, tmp_path, tiny).reused == ""
+
+
 def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
     """Cells of a protocol that every process knows, computed apart."""
     some = [

@@ -49,7 +49,8 @@ def run_leaderboard(
     count = iter(range(1, len(cells) + 1))
 
     def told(found: Found) -> None:
-        cell, said = found.cell, found.error or f"{found.seconds:.1f} s"
+        before = f", {found.reused} reused" if found.reused else ""
+        cell, said = found.cell, found.error or f"{found.seconds:.1f} s{before}"
         note(f"{next(count)}/{len(cells)} {cell.model} seed {cell.seed} fold {cell.fold}: {said}")
 
     found = compute_all(cells, root, jobs, told)

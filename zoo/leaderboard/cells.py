@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cache
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-import zoo
 from zoo import archive
+from zoo.assembly import Assembly
+from zoo.datasets.digest import contents
 from zoo.datasets.records import Sequences
 from zoo.ensemble import Ensemble
 from zoo.errors import DamagedRunError
+from zoo.fingerprint import code, fingerprint, key
 from zoo.fitting import fit
 from zoo.leaderboard.protocols import PROTOCOLS, Protocol
 from zoo.prediction import Prediction, Predictive
-from zoo.run import Run, create, load
-from zoo.rundir import Resume
-from zoo.strategies import Svi
+from zoo.run import create
 
 __all__ = ["Cell", "Found", "compute", "compute_all"]
 
-VERSION = 1
+VERSION = 2
 # a multiple of the 16 components of exact mixtures: an equal ensemble of both then has 48
 DRAWS = 48
 _PARTS = ("location", "noise", "epistemic", "draws")
@@ -56,50 +55,56 @@ class Cell:
         pairs = zip(self.model.split("+"), self.settings, strict=True)
         return tuple((name, dict(settings)) for name, settings in pairs)
 
-    @property
-    def key(self) -> str:
-        """A hash of everything that the answer depends on."""
-        return _hash(self.protocol, self.model, self.settings, self.seed, self.rows)
-
-    def folder(self, root: Path) -> Path:
-        """Where its answer is kept."""
-        return root / self.protocol / self.model / f"seed-{self.seed}-{self.key}"
-
-    def training(self, root: Path, data: str, member: int) -> Path:
-        """Where a member is trained, for all protocols on these data and all ensembles."""
-        name, settings = self.members[member]
-        key = _hash(data, name, sorted(settings.items()), self.seed, self.rows)
-        return root / "trained" / f"{name}-{key}"
+    def folder(self, root: Path, made_of: object) -> Path:
+        """Where its answer is kept, by all that it depends on."""
+        return root / self.protocol / self.model / f"seed-{self.seed}-{key(made_of)}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
     """The answer of a cell: a prediction of its rows, or the error that stopped it.
 
-    ``seconds`` are those of its trainings.
+    ``seconds`` are those of its trainings, whenever they were; ``reused`` says whether the answer
+    or the trainings were found before.
     """
 
     cell: Cell
     prediction: Prediction | None
     error: str
     seconds: float
+    reused: Literal["", "answer", "training"] = ""
 
 
 def compute(cell: Cell, root: Path, protocol: Protocol | None = None) -> Found:
     """The answer, from its folder if it was found before; a training goes on where it stopped."""
-    folder = cell.folder(root)
-    kept = _kept(cell, folder)
-    if kept is not None:
-        return kept
     asked = PROTOCOLS[cell.protocol] if protocol is None else protocol
     try:
-        prediction, seconds = _predicted(cell, asked, asked.load(), root)
-        found = Found(cell=cell, prediction=prediction, error="", seconds=seconds)
+        data = _loaded(asked.load, os.environ.get("MOVEZOO_DATA"))
+        inside = set(cell.rows)
+        train = data[[i for i in range(len(data)) if i not in inside]]
+        made = [create(name, train, seed=cell.seed, **options) for name, options in cell.members]
+        folder = cell.folder(
+            root, _made_of(cell, asked, data, [fingerprint(m, train) for m in made])
+        )
+        return _kept(cell, folder) or _answered(cell, asked, data, train, made, root, folder)
     except (RuntimeError, TypeError, ValueError) as stop:
         error = f"{type(stop).__name__}: {stop}"
-        found = Found(cell=cell, prediction=None, error=error, seconds=0.0)
-    _keep(found, folder)
-    return found
+        return Found(cell=cell, prediction=None, error=error, seconds=0.0)
+
+
+@cache
+def _loaded(load: Callable[[], Sequences], folder: str | None) -> Sequences:
+    """The data, once in a process; ``folder`` is where the loader looks."""
+    return load()
+
+
+def _made_of(
+    cell: Cell, asked: Protocol, data: Sequences, members: list[dict[str, str]]
+) -> list[object]:
+    """Trainings, question, data and code: all that an answer depends on."""
+    values = {f.name: getattr(asked, f.name) for f in fields(asked)}
+    question = {name: repr(value) for name, value in values.items() if not callable(value)}
+    return [members, question, cell.rows, contents(data, "judged"), code([__name__])]
 
 
 def compute_all(
@@ -144,37 +149,36 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _predicted(
-    cell: Cell, protocol: Protocol, data: Sequences, root: Path
-) -> tuple[Prediction, float]:
-    """The answer, and the seconds that its members took to train."""
-    inside = set(cell.rows)
-    train = data[[i for i in range(len(data)) if i not in inside]]
-    members = [_trained(cell, protocol, train, root, k) for k in range(len(cell.members))]
+def _answered(
+    cell: Cell,
+    asked: Protocol,
+    data: Sequences,
+    train: Sequences,
+    made: list[Assembly],
+    root: Path,
+    folder: Path,
+) -> Found:
+    """The answer of members trained before, or now; it is kept in ``folder``."""
+    homes = [root / "trained" / f"{m.entry.name}-{key(fingerprint(m, train))}" for m in made]
+    before = all(archive.exists(home, "run") for home in homes)
+    members = [
+        fit(m, train, run_dir=home, resume="auto") for m, home in zip(made, homes, strict=True)
+    ]
     run = members[0] if len(members) == 1 else Ensemble(members=tuple(members))
-    answer = protocol.answer(run, data[list(cell.rows)], draws=DRAWS, seed=cell.seed)
-    return answer, sum(member.seconds for member in members)
-
-
-def _trained(cell: Cell, protocol: Protocol, train: Sequences, root: Path, member: int) -> Run:
-    """A member trained before, or now; an interrupted training goes on."""
-    name, settings = cell.members[member]
-    folder = cell.training(root, protocol.data or cell.protocol, member)
-    if archive.exists(folder, "run"):
-        return load(folder)
-    assembly = create(name, train, seed=cell.seed, **settings)
-    resume: Resume = "auto" if isinstance(assembly.inference, Svi) else "never"
-    return fit(assembly, train, run_dir=folder, resume=resume)
-
-
-def _hash(*told: Any) -> str:
-    text = json.dumps([*told, zoo.__version__])
-    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+    found = Found(
+        cell=cell,
+        prediction=asked.answer(run, data[list(cell.rows)], draws=DRAWS, seed=cell.seed),
+        error="",
+        seconds=sum(member.seconds for member in members),
+        reused="training" if before else "",
+    )
+    _keep(found, folder)
+    return found
 
 
 def _keep(found: Found, folder: Path) -> None:
     tensors: dict[str, Tensor] = {}
-    meta: dict[str, Any] = {"error": found.error, "seconds": found.seconds}
+    meta: dict[str, Any] = {"seconds": found.seconds}
     if found.prediction is not None:
         p = found.prediction
         parts = {name: getattr(p.predictive, name) for name in _PARTS}
@@ -199,8 +203,6 @@ def _kept(cell: Cell, folder: Path) -> Found | None:
         meta, tensors = archive.read(folder, "cell", version=VERSION)
     except DamagedRunError:
         return None
-    if meta["error"]:
-        return None
     prediction = Prediction(
         predictive=Predictive(**tensors, joint=meta["joint"]),
         axes=tuple(meta["axes"]),
@@ -210,4 +212,5 @@ def _kept(cell: Cell, folder: Path) -> Found | None:
         rate=meta["rate"],
         offset=meta["offset"],
     )
-    return Found(cell=cell, prediction=prediction, error="", seconds=meta["seconds"])
+    seconds = meta["seconds"]
+    return Found(cell=cell, prediction=prediction, error="", seconds=seconds, reused="answer")
