@@ -238,7 +238,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="ar",
-            summary="Linear autoregression of every channel, or of all, exact",
+            summary="Linear autoregression, lags and ridge by cross-validation of its forecasts",
             thesis="baseline, not in the thesis",
             model="zoo.models.autoregression:Autoregression",
             guide=None,

@@ -65,5 +65,5 @@ def test_penalties_are_of_the_model_s_own_number_type() -> None:
     """Settings reach float64 sums with all their digits."""
     name = "zoo.models.autoregression:Autoregression"
     model = load(name)(movements().layout, load(name).config_class(order=1, noise_floor=0.1))
-    floor = model._floor(torch.zeros(7, 1, 1, dtype=torch.float64))
-    assert floor.dtype == torch.float64 and float(floor) == 0.1**2
+    floor = model._shrunk(torch.zeros(2, 7, 7, dtype=torch.float64))
+    assert floor.dtype == torch.float64 and float(floor[0, 0, 0]) == 0.1**2

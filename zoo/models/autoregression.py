@@ -1,4 +1,4 @@
-"""A linear autoregression with its exact conditional Gaussian: `ar`."""
+"""A linear autoregression chosen by cross-validation of its forecasts: `ar`."""
 
 from __future__ import annotations
 
@@ -8,242 +8,277 @@ from typing import ClassVar, Literal
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.models.baseline import check_fitted, movements_of, seen_entries
+from zoo.dynamics.analogues import interpolated
+from zoo.dynamics.banded import conditional, precision
+from zoo.dynamics.chain_selection import RIDGES, Choice, Trials, folds_of, places
+from zoo.dynamics.chains import Chain
+from zoo.dynamics.components import alike
+from zoo.models.baseline import (
+    check_fitted,
+    moments,
+    movement_groups,
+    movements_of,
+    seen_entries,
+)
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
 __all__ = ["Autoregression", "Config"]
 
+ORDERS = (1, 2, 4, 8, 16)
+RUNS = 5
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Settings of :class:`Autoregression`.
+    """Settings of :class:`Autoregression`; None is chosen by cross-validation.
 
-    ``order`` is p; ``coupling`` says whether channels follow from their own past alone
-    (``channel``) or from that of all (``vector``); ``ridge`` is the penalty on A for each
-    training frame, in scaled units; ``noise_floor`` the least innovation, in scaled units.
+    ``order`` is the longest lag, in frames; ``coupling`` says whether channels follow from their
+    own past alone (``channel``) or from that of all (``vector``); ``ridge`` is the penalty on A
+    for each training frame, ``noise_floor`` the least innovation, both in scaled units. Forecasts
+    from ``places`` of every held-out movement give the bands. ``shrinkage`` is the share of Q that
+    is taken from its diagonal alone.
     """
 
-    order: int = 2
-    coupling: Literal["channel", "vector"] = "channel"
-    ridge: float = 1e-6
+    order: int | None = None
+    coupling: Literal["channel", "vector"] | None = None
+    ridge: float | None = None
+    places: int = 8
+    shrinkage: float = 0.1
     noise_floor: float = 1e-4
 
     def __post_init__(self) -> None:
         """Refuse settings without a meaning."""
-        if self.order < 1:
-            raise ValueError(f"order must be at least 1; got {self.order}")
-        if self.coupling not in ("channel", "vector"):
+        for name in ("order", "places"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1; got {value}")
+        if self.coupling not in (None, "channel", "vector"):
             raise ValueError(f"coupling must be channel or vector; got {self.coupling!r}")
-        if not (self.ridge >= 0 and self.noise_floor > 0):
-            raise ValueError(
-                "ridge must not be negative and noise_floor must be positive; "
-                f"got {self.ridge}, {self.noise_floor}"
-            )
+        for name in ("ridge", "noise_floor"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive; got {value}")
+        if not 0 <= self.shrinkage <= 1:
+            raise ValueError(f"shrinkage must be between 0 and 1; got {self.shrinkage}")
 
 
 class Autoregression(nn.Module):
-    """Every frame is a linear function of the p frames before it: the textbook's AR(p).
+    """Every frame is a linear function of frames before it, at lags that double.
 
-    x_{1:p} ~ N(μ, S), x_t ~ N(c + Σ_{i=1}^p A_i x_{t−i}, Q)
+    x_t ~ N(c_j + Σ_{i=1}^j A_{ji} x_{t−l_i}, Q_j),  l = 1, 2, 4, …, p
 
-    A and c by ridge regression over all training frames whose p predecessors were seen, Q from
-    the residuals, μ and S from all runs of p frames. With ``coupling="channel"`` each channel is
-    an own AR(p); with ``vector`` they are one, and Q is full. Lütkepohl, *New Introduction to
-    Multiple Time Series Analysis* (2005), ch. 3.
+    j counts the lags that reach back from t: the memory grows over the first p frames, so that
+    three observed frames are answered as well as a hundred. c_j and A_j by ridge regression over
+    all training frames whose j predecessors were observed, with the past of the same channel
+    (``coupling="channel"``) or of all (``vector``). p, coupling and ridge are those with the least
+    squared error of forecasts of held-out training movements up to their ends, over at most four
+    folds of whole movements (the windows of one movement stay together; a single movement is cut
+    in two). Q_j is the covariance of held-out innovations, shrunk towards its diagonal. A
+    spectral radius above 1 is shrunk to 1. Lütkepohl, *New Introduction to Multiple Time Series
+    Analysis* (2005), ch. 3; Hoerl & Kennard, *Ridge regression*, Technometrics 12 (1970).
 
-    A movement is one Gaussian with a banded precision. Conditioning it on what was seen gives
-    forecast and imputation with their exact moments and joint draws, missing entries among the
-    frames seen included. All spread is of the path: there is no observation noise, so that seen
-    entries are returned as they are. The uncertainty of A, c and Q is not in the bands.
+    A movement is one Gaussian with a banded precision. Conditioning it on what was observed gives
+    forecast and imputation with their exact moments and joint draws, missing entries included.
+    The bands are these standard deviations times the ratio of held-out errors to them: of forecasts
+    by lead time and channel, of imputations by channel, from held-out training movements with the
+    same entries hidden. There is no observation noise: observed entries are returned as they are.
+    The program leaves out frames with a missing entry, or with one in their past.
 
-    Defaults: p = 2, own past only; data standardised.
+    It is a baseline, not in the thesis, and it has no guide: there is no latent variable.
+
+    Defaults: all chosen; p of 1, 2, 4, 8 and 16; data standardised.
     """
 
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float64
+    lags: Tensor
     intercept: Tensor
     coefficients: Tensor
     innovation: Tensor
-    start_mean: Tensor
-    start_covariance: Tensor
+    lead_ratio: Tensor
+    channel_ratio: Tensor
+    memory: Tensor
+    seen: Tensor
+    fold: Tensor
+    jointly: Tensor
+    ridge: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """Placeholders until :meth:`condition`."""
         super().__init__()
         self.layout, self.config = layout, config
-        channels = len(layout.channels)
-        self.width = channels if config.coupling == "vector" else 1
-        self.blocks = channels // self.width
-        names = ("intercept", "coefficients", "innovation", "start_mean", "start_covariance")
-        for name in names:
+        fitted = ("intercept", "coefficients", "innovation", "lead_ratio", "channel_ratio")
+        for name in (*fitted, "memory", "ridge"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
+        for name in ("lags", "fold"):
+            self.register_buffer(name, torch.empty(0, dtype=torch.long))
+        for name in ("seen", "jointly"):
+            self.register_buffer(name, torch.empty(0, dtype=torch.bool))
 
     def condition(self, data: Sequences | Pairs) -> None:
-        """Regress every frame on its p predecessors.
+        """Choose and fit the chain, and measure its forecasts.
 
-        ``coefficients`` become (lag, block, width, width), ``intercept`` (block, width),
-        ``innovation`` Q (block, width, width); a block is a channel or all channels.
+        ``intercept`` becomes (level, channel), ``coefficients`` (level, lag, channel, channel),
+        ``innovation`` Q (level, channel, channel).
         """
-        movements = movements_of("ar", data, self.dtype)
-        values, mask = self._blocked(movements.values), self._blocked(movements.mask)
-        p = self.config.order
-        runs, whole = self._runs(values, mask)
-        self._check_enough(whole.sum((0, 1)), movements)
-        past, now = runs.split([p * self.width, self.width], -1)
-        beta, self.innovation = self._regress(past, now, whole[..., None].to(past))
-        self.intercept = beta[:, 0]
-        lags = beta[:, 1:].unflatten(1, (p, self.width)).flip(1)
-        self.coefficients = lags.permute(1, 0, 3, 2).contiguous()
-        self.start_mean, self.start_covariance = self._start(past, whole[..., None].to(past))
+        trials = self._trials(movements_of("ar", data, self.dtype))
+        self.memory, self.seen, self.fold = trials.values, trials.mask, trials.fold
+        choice = trials.chosen(self._choices(trials, data.channels))
+        self.jointly = torch.tensor([choice.jointly], device=self.seen.device)
+        self.ridge = self.memory.new_tensor([choice.ridge])
+        fitted, innovation = trials.fitted(choice)
+        fitted = fitted.stable()
+        self.lags = torch.tensor(fitted.lags, device=self.fold.device)
+        self.intercept, self.coefficients = fitted.intercept, fitted.coefficients
+        self.innovation = self._shrunk(innovation)
+        course = trials.course(choice, self.config.places)
+        self.lead_ratio, self.channel_ratio = course.ratios(self._variance(len(course.count)))
+
+    def _shrunk(self, innovation: Tensor) -> Float[Tensor, "level channel channel"]:
+        share, own = self.config.shrinkage, innovation.diagonal(dim1=1, dim2=2)
+        floor = self.config.noise_floor**2
+        return (1 - share) * innovation + torch.diag_embed(share * own + floor)
+
+    @property
+    def chain(self) -> Chain:
+        """The fitted chain."""
+        check_fitted("ar", self.innovation)
+        return Chain(tuple(self.lags.tolist()), self.intercept, self.coefficients)
 
     def forward(self, batch: Batch) -> Tensor:
-        """The generative program; a term with a missing entry in its p + 1 frames is left out."""
-        check_fitted("ar", self.innovation)
-        p, frames = self.config.order, batch.values.shape[1]
-        if frames <= p:
-            raise ValueError(f"windows have {frames} frames; ar of order {p} needs {p + 1}")
-        values, mask = self._blocked(batch.values), self._blocked(seen_entries(batch))
-        runs, whole = self._runs(values, mask)
-        past, now = runs.split([p * self.width, self.width], -1)
-        first_seen = mask[:, :p].all(1).all(-1)
-        start = dist.MultivariateNormal(self.start_mean, self.start_covariance)
-        step = dist.MultivariateNormal(self._next(past), self.innovation)
+        """The generative program, without frames that miss an entry or whose past does."""
+        x, mask = batch.values, seen_entries(batch).all(-1)
+        chain, whole = self.chain, mask.clone()
+        for lag in chain.lags:
+            whole[:, lag:] &= mask[:, :-lag]
+        level = torch.tensor([chain.level(t) for t in range(x.shape[1])], device=x.device)
+        root = torch.linalg.cholesky(self.innovation)[level]
+        step = dist.MultivariateNormal(chain.predicted(x), scale_tril=root)
         with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
-            pyro.sample("x_start", start.mask(first_seen).to_event(1), obs=past[:, 0])
-            x: Tensor = pyro.sample("x", step.mask(whole).to_event(2), obs=now)
-        return x.flatten(2)
+            found: Tensor = pyro.sample("x", step.mask(whole).to_event(1), obs=x)
+        return found
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """p(x_{k+1:k+horizon} | x_{1:k}), exact; the last p frames suffice where they are seen."""
-        check_fitted("ar", self.innovation)
-        p, mask = self.config.order, seen_entries(batch)
-        kept = p if bool(mask[:, -p:].all()) else batch.values.shape[1]
-        seen, mask = batch.values[:, -kept:], mask[:, -kept:]
-        kept = seen.shape[1]
-        ahead = max(horizon, p - kept)
-        values = torch.cat([seen, seen.new_zeros(len(seen), ahead, seen.shape[2])], 1)
-        mask = torch.cat([mask, mask.new_zeros(len(seen), ahead, seen.shape[2])], 1)
-        mean, spread, paths = self._conditional(values, mask, draws)
-        future = slice(kept, kept + horizon)
-        return Predictive(
-            location=mean[None, :, future],
-            epistemic=spread[:, future],
-            draws=paths[:, :, future],
-        )
+        """p(x_{k+1:k+horizon} | x_{1:k}), its standard deviations times the held-out ratios."""
+        longest, mask = self.chain.lags[-1], seen_entries(batch)
+        if mask.shape[1] >= longest and bool(mask[:, -longest:].all()):
+            mean, spread, paths = self._ahead(batch.values[:, -longest:], horizon, draws)
+        else:
+            widen = (0, 0, 0, horizon)
+            values, known = (nn.functional.pad(v, widen) for v in (batch.values, mask))
+            found = self._conditional(values, known, draws)
+            mean, spread, paths = (part[..., -horizon:, :] for part in found)
+        lead = torch.arange(horizon, device=mean.device).clamp(max=len(self.lead_ratio) - 1)
+        ratio = self.lead_ratio[lead, None] * self.channel_ratio
+        wider = mean + ratio * (paths - mean)
+        return Predictive(location=mean[None], epistemic=ratio * spread, draws=wider)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """p(x_missing | x_seen), exact; seen entries are returned with no more than rounding."""
-        check_fitted("ar", self.innovation)
-        p, frames = self.config.order, batch.values.shape[1]
-        if frames < p:
-            raise ValueError(f"movements have {frames} frames; ar of order {p} needs {p}")
-        mean, spread, paths = self._conditional(batch.values, seen_entries(batch), draws)
-        return Predictive(location=mean[None], epistemic=spread, draws=paths)
+        """p(x_missing | x_observed), exact; observed entries are returned as they are."""
+        mask = seen_entries(batch)
+        mean, spread, paths = self._conditional(batch.values, mask, draws)
+        patterns, which = torch.unique(mask, dim=0, return_inverse=True)
+        count = max(2, self.config.places // len(patterns))
+        ratio = torch.stack([self._imputation_ratio(p, count) for p in patterns])[which][:, None]
+        rounding = torch.finfo(mean.dtype).eps ** 0.5
+        return Predictive(
+            location=mean[None],
+            epistemic=(ratio * spread).clamp(min=rounding),
+            draws=mean + ratio * (paths - mean),
+        )
 
-    def _blocked(self, x: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch block width"]:
-        blocks: Tensor = x.unflatten(-1, (self.blocks, self.width))
-        return blocks
+    def _imputation_ratio(
+        self, pattern: Bool[Tensor, "time channel"], movements: int
+    ) -> Float[Tensor, " channel"]:
+        """Errors over standard deviations where held-out movements miss what ``pattern`` misses."""
+        trials = Trials(self.memory, self.seen, self.fold)
+        choice = Choice(int(self.lags[-1]), bool(self.jointly), float(self.ridge))
+        frames = min(len(pattern), self.memory.shape[1])
+        squares = [torch.zeros_like(self.channel_ratio), torch.zeros_like(self.channel_ratio)]
+        last = len(self.memory) - 1
+        for i in places(0, last, min(movements, last + 1)):
+            Λ = precision(trials.part(choice, int(self.fold[i])), self.innovation, frames)
+            x, known = self.memory[i, :frames], self.seen[i, :frames]
+            mean, spread, _ = conditional(Λ, x[None], pattern[:frames] & known, 0)
+            asked = known & ~pattern[:frames]
+            ratio = (mean[0] - x) / spread.clamp(min=torch.finfo(x.dtype).tiny)
+            squares[0] += (ratio.square() * asked).sum(0)
+            squares[1] += asked.sum(0)
+        known = squares[1] > 0
+        return torch.where(known, squares[0] / squares[1].clamp(min=1), 1.0).sqrt()
 
-    def _runs(
-        self, values: Tensor, mask: Tensor
-    ) -> tuple[Float[Tensor, "window run block value"], Float[Tensor, "window run block"]]:
-        """All runs of p + 1 frames, the oldest first, and whether they were seen in full."""
-        length = self.config.order + 1
-        runs = values.unfold(1, length, 1).movedim(-1, -2).flatten(-2)
-        whole = mask.unfold(1, length, 1).movedim(-1, -2).flatten(-2).all(-1)
-        return runs, whole
-
-    def _check_enough(self, count: Tensor, data: Sequences) -> None:
-        need = 2 + self.config.order * self.width
-        short = int(count.argmin())
-        if count[short] < need:
+    def _trials(self, data: Sequences) -> Trials:
+        """Movements in folds; one alone is cut in two."""
+        mean, _, _ = moments(data.values.flatten(0, 1), data.mask.flatten(0, 1), 0)
+        values, mask, group = (
+            interpolated(data.values, data.mask, mean),
+            data.mask,
+            movement_groups(data),
+        )
+        longest, alone = int(data.lengths.max()), len(group.unique()) < 2
+        if longest < (6 if alone else 3):
             raise ValueError(
-                f"ar of order {self.config.order} needs {need} runs of {self.config.order + 1} "
-                f"frames without a missing entry; channel {data.channels[short * self.width]} "
-                f"has {int(count[short])}"
+                "ar needs movements of at least 3 frames (6 where there is one alone); "
+                f"the longest has {longest}"
             )
+        if alone:
+            half = longest // 2
+            values, mask = (torch.cat([v[:, :half], v[:, half : 2 * half]]) for v in (values, mask))
+            group = torch.arange(2, device=values.device).repeat_interleave(len(data))
+        return Trials(values, mask, folds_of(group))
 
-    def _regress(self, past: Tensor, now: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Ridge estimate (block, 1 + lags, width) with the intercept first, and Q."""
-        x = torch.cat([torch.ones_like(past[..., :1]), past], -1)
-        count = weight.sum((0, 1))[..., None]
-        penalty = x.new_full((x.shape[-1],), self.config.ridge)
-        penalty[0] = 0
-        gram = torch.einsum("stbf,stbg->bfg", weight * x, x) + count * penalty.diag()
-        beta = torch.linalg.solve(gram, torch.einsum("stbf,stbw->bfw", weight * x, now))
-        residual = weight * (now - torch.einsum("stbf,bfw->stbw", x, beta))
-        innovation = torch.einsum("stbv,stbw->bvw", residual, residual) / (count - x.shape[-1])
-        return beta, innovation + self._floor(innovation)
+    def _choices(self, trials: Trials, channels: tuple[str, ...]) -> list[Choice]:
+        """What the settings leave open and the data allow."""
+        config, frames = self.config, trials.values.shape[1]
+        orders = [p for p in ORDERS if 2 * p < frames] if config.order is None else [config.order]
+        couplings = ["channel", "vector"] if config.coupling is None else [config.coupling]
+        ridges = RIDGES if config.ridge is None else (config.ridge,)
+        pairs = [(p, c == "vector") for p in orders for c in couplings]
+        able = [(p, j) for p, j in pairs if p < frames and bool((trials.runs(p, j) >= RUNS).all())]
+        if not able:
+            self._refuse(trials, *pairs[0], channels)
+        return [Choice(p, j, ridge) for p, j in able for ridge in ridges]
 
-    def _start(self, past: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        count = weight.sum((0, 1))
-        mean = (past * weight).sum((0, 1)) / count
-        off = (past - mean) * weight
-        covariance = torch.einsum("stbv,stbw->bvw", off, off) / (count - 1)[..., None]
-        return mean, covariance + self._floor(covariance)
+    def _refuse(self, trials: Trials, order: int, jointly: bool, channels: tuple[str, ...]) -> None:
+        frames = trials.values.shape[1]
+        runs = trials.runs(order, jointly) if order < frames else trials.values.new_zeros(1)
+        worst = int(runs.argmin())
+        which = f"channel {channels[worst]}" if len(runs) > 1 else "all channels together"
+        raise ValueError(
+            f"ar of order {order} needs {RUNS} runs of {order + 1} frames without a missing entry "
+            f"outside every fold; {which} leave {int(runs[worst])}"
+        )
 
-    def _floor(self, like: Float[Tensor, "block width width"]) -> Float[Tensor, "width width"]:
-        return self.config.noise_floor**2 * _identity(like)
+    def _variance(self, steps: int) -> Float[Tensor, "step channel"]:
+        """Of every frame after a whole memory."""
+        Ψ = self.chain.responses(steps)
+        return (Ψ @ self.innovation[-1] * Ψ).sum(-1).cumsum(0)
 
-    def _next(self, past: Float[Tensor, "window run block value"]) -> Tensor:
-        lags = past.unflatten(-1, (self.config.order, self.width)).flip(-2)
-        follows: Tensor = torch.einsum("ibvw,ntbiw->ntbv", self.coefficients, lags)
-        return self.intercept + follows
-
-    def _precision(self, frames: int) -> tuple[Tensor, Tensor]:
-        """Λ (block, m, m) and h = Λ·mean (block, m) of a whole movement, m = frames × width."""
-        p, w = self.config.order, self.width
-        white = torch.linalg.inv(torch.linalg.cholesky(self.innovation))
-        start = torch.linalg.inv(torch.linalg.cholesky(self.start_covariance))
-        rows = self.innovation.new_zeros(frames, frames, self.blocks, w, w)
-        t = torch.arange(p, frames, device=rows.device)
-        rows[t, t] = white
-        for i in range(1, p + 1):
-            rows[t, t - i] = -white @ self.coefficients[i - 1]
-        rows[:p, :p] = start.unflatten(2, (p, w)).unflatten(1, (p, w)).permute(1, 3, 0, 2, 4)
-        root = rows.permute(2, 0, 3, 1, 4).flatten(3, 4).flatten(1, 2)
-        first = (start @ self.start_mean[..., None]).squeeze(-1)
-        later = (white @ self.intercept[..., None]).squeeze(-1).repeat(1, frames - p)
-        offset = torch.cat([first, later], 1)
-        return root.mT @ root, (root.mT @ offset[..., None]).squeeze(-1)
+    def _ahead(self, known: Tensor, horizon: int, draws: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, standard deviation and joint draws after frames that reach as far as the lags."""
+        mean = self.chain.rolled(known, horizon)
+        root = torch.linalg.cholesky(self.innovation[-1])
+        noise = torch.randn(draws, *mean.shape, dtype=mean.dtype, device=mean.device) @ root.mT
+        paths = self.chain.rolled(known, horizon, noise)
+        return mean, self._variance(horizon).sqrt().expand_as(mean), paths
 
     def _conditional(
-        self, values: Tensor, mask: Tensor, draws: int
+        self,
+        values: Float[Tensor, "window time channel"],
+        mask: Bool[Tensor, "window time channel"],
+        draws: int,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, standard deviation and joint draws of all entries, given those seen."""
-        precision, shift = self._precision(values.shape[1])
-        x, seen = (self._stacked(self._blocked(v)) for v in (values, mask))
-        if bool((seen == seen[:1]).all()):
-            seen = seen[:1]
-        missing = (~seen).to(x)
-        x = x * seen
-        held = missing[..., None] * precision * missing[..., None, :] + torch.diag_embed(
-            1 - missing
-        )
-        root = torch.linalg.cholesky(held)
-        pull = missing * (shift - (precision @ x[..., None]).squeeze(-1))
-        mean = x + missing * torch.cholesky_solve(pull[..., None], root).squeeze(-1)
-        inverse = torch.linalg.solve_triangular(root, _identity(root), upper=False)
-        rounding = torch.finfo(x.dtype).eps ** 0.5
-        spread = (missing * inverse.square().sum(-2).sqrt()).clamp(min=rounding).expand_as(mean)
-        unit = torch.randn(draws, *mean.shape, dtype=x.dtype, device=x.device)
-        paths = mean + missing * torch.einsum("nbij,snbi->snbj", inverse, unit)
-        return self._framed(mean), self._framed(spread), self._framed(paths)
-
-    def _stacked(self, x: Float[Tensor, "window time block width"]) -> Tensor:
-        return x.transpose(1, 2).flatten(2)
-
-    def _framed(self, x: Float[Tensor, "*sample window block value"]) -> Tensor:
-        frames: Tensor = x.unflatten(-1, (-1, self.width)).transpose(-3, -2)
-        return frames.flatten(-2)
-
-
-def _identity(like: Float[Tensor, "*batch n n"]) -> Float[Tensor, "n n"]:
-    return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
+        """Mean, standard deviation and joint draws of all entries, given those observed."""
+        Λ = precision(self.chain, self.innovation, values.shape[1])
+        mean, spread = values.clone(), torch.zeros_like(values)
+        paths = values.repeat(draws, 1, 1, 1)
+        for rows, pattern in alike(mask):
+            mean[rows], spread[rows], paths[:, rows] = conditional(Λ, values[rows], pattern, draws)
+        return mean, spread, paths

@@ -42,10 +42,11 @@ def movement_groups(data: Sequences) -> Int[Tensor, " sequence"]:
     """
     names = [k for k in data.groups if k != "start"]
     if not names:
-        return torch.arange(len(data))
+        return torch.arange(len(data), device=data.lengths.device)
     numbers: dict[tuple[object, ...], int] = {}
     rows = zip(*(data.groups[name] for name in names), strict=True)
-    return torch.tensor([numbers.setdefault(row, len(numbers)) for row in rows])
+    found = [numbers.setdefault(row, len(numbers)) for row in rows]
+    return data.lengths.new_tensor(found)
 
 
 def moments(values: Tensor, mask: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
