@@ -8,17 +8,67 @@ as standard normal scores Φ⁻¹(level), so that neither tail loses digits.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Predictive", "cdf", "log_density", "normal_score", "pooled", "quantile"]
+__all__ = ["Deferred", "Predictive", "cdf", "log_density", "normal_score", "pooled", "quantile"]
 
 _BLOCK = 2**18
 _FARTHEST = 37.0
+
+
+class Deferred:
+    """Joint draws that are made when they are first asked for, of a random stream set beforehand.
+
+    ``make`` draws from torch's default generator. Its seed is drawn from it at once, so that the
+    draws depend on the moment they were promised in, not on that they are made in.
+
+    >>> promised = Deferred((3, 2), lambda: torch.randn(3, 2))
+    >>> bool((promised.tensor() == promised.tensor()).all())
+    True
+    """
+
+    def __init__(
+        self, shape: Sequence[int], make: Callable[[], Tensor], seed: int | None = None
+    ) -> None:
+        """Promise draws of this shape."""
+        self.shape = torch.Size(shape)
+        self._make = make
+        self._made: Tensor | None = None
+        self._seed = int(torch.randint(2**62, ())) if seed is None else seed
+
+    def tensor(self) -> Tensor:
+        """The draws; the caller's random stream stays untouched."""
+        if self._made is None:
+            with torch.random.fork_rng(devices=[]):
+                torch.default_generator.manual_seed(self._seed)
+                self._made = self._make()
+        return self._made
+
+    def map(self, change: Callable[[Tensor], Tensor], shape: Sequence[int]) -> Deferred:
+        """The same draws, changed once they are made."""
+        make = self._make
+        return Deferred(shape, lambda: change(make()), self._seed)
+
+
+class _Draws:
+    """Draws of a predictive: a tensor to all who read them, promised or not."""
+
+    @overload
+    def __get__(self, owner: None, kind: type) -> None: ...
+    @overload
+    def __get__(self, owner: Predictive, kind: type) -> Tensor | None: ...
+    def __get__(self, owner: Predictive | None, kind: type) -> Tensor | None:
+        held = None if owner is None else owner.__dict__["_draws"]
+        return held.tensor() if isinstance(held, Deferred) else held
+
+    def __set__(self, owner: Predictive, value: Tensor | Deferred | None) -> None:
+        owner.__dict__["_draws"] = value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,14 +80,14 @@ class Predictive:
     the model has none to give. ``epistemic`` is a further standard deviation of the mean where a
     model knows it in closed form; the spread of the components counts as epistemic too.
     ``joint`` says that each component is one joint trajectory; ``draws`` are joint draws of the
-    noise-free path where the moments themselves are exact.
+    noise-free path where the moments themselves are exact, or :class:`Deferred` ones.
     """
 
     location: Float[Tensor, "component *shape"]
     noise: Tensor | None = None
     epistemic: Tensor | None = None
     joint: bool = False
-    draws: Float[Tensor, "sample *shape"] | None = None
+    draws: _Draws = _Draws()
 
     def __post_init__(self) -> None:
         """Refuse parts that do not fit ``location``."""
@@ -46,8 +96,8 @@ class Predictive:
             raise ValueError(f"location needs a component axis; it has shape {tuple(shape)}")
         _check_broadcast("noise", self.noise, shape)
         _check_broadcast("epistemic", self.epistemic, shape)
-        if self.draws is not None and (not len(self.draws) or self.draws.shape[1:] != shape[1:]):
-            got = tuple(self.draws.shape)
+        got = None if self._held is None else tuple(self._held.shape)
+        if got is not None and (not got[0] or got[1:] != tuple(shape[1:])):
             raise ValueError(f"draws have shape {got}; (sample, *{tuple(shape[1:])}) is needed")
 
     @property
@@ -63,8 +113,22 @@ class Predictive:
             noise=None if self.noise is None else self.noise * scale.abs(),
             epistemic=None if self.epistemic is None else self.epistemic * scale.abs(),
             joint=self.joint,
-            draws=None if self.draws is None else self.draws * scale + shift,
+            draws=self.redrawn(lambda draws: draws * scale + shift),
         )
+
+    def redrawn(
+        self, change: Callable[[Tensor], Tensor], width: int | None = None
+    ) -> Deferred | Tensor | None:
+        """The draws after ``change``, deferred where they are; ``width`` is their new last size."""
+        if not isinstance(self._held, Deferred):
+            return None if self._held is None else change(self._held)
+        *lead, last = self._held.shape
+        return self._held.map(change, (*lead, last if width is None else width))
+
+    @property
+    def _held(self) -> Deferred | Tensor | None:
+        held: Deferred | Tensor | None = self.__dict__["_draws"]
+        return held
 
 
 def pooled(parts: Sequence[Predictive]) -> Predictive:

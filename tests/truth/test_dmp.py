@@ -19,8 +19,10 @@ from zoo.dynamics.imitation import (
     target_force,
     trajectory_matrix,
 )
+from zoo.dynamics.kalman import PathNoise
 from zoo.dynamics.population import Population
-from zoo.dynamics.rollout import Timing, path_noise, roll_out
+from zoo.dynamics.rollout import Timing, roll_out
+from zoo.dynamics.sums import sights
 from zoo.dynamics.timing import period_of
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
@@ -139,7 +141,9 @@ def joint(model, timing=None):
     """Mean, covariance of the path and the observation noise, (channel, time) in one vector."""
     timing = Timing(FRAMES - 1.0) if timing is None else timing
     design = torch.block_diag(*[roll_out(model.primitive, FRAMES, timing)] * CHANNELS)
-    forces = path_noise(model.primitive, FRAMES, timing)
+    forces = PathNoise(model.primitive.system(timing), FRAMES).respond(
+        torch.eye(FRAMES - 1).double()
+    )
     process = [v * forces @ forces.T for v in model.noise.square()]
     mean, covariance = dense(model.population)
     noise = (model.noise.square() * model.ratio).repeat_interleave(FRAMES)
@@ -167,6 +171,40 @@ def test_forecast_and_filled_gap_are_the_conditional_of_the_dense_gaussian():
     filled = model.impute(begun, None, draws=2)
     torch.testing.assert_close(whole_path.location, filled.location[:, :, 10:])
     torch.testing.assert_close(whole_path.epistemic, filled.epistemic[:, :, 10:])
+
+
+@pytest.mark.parametrize("hidden", [0, 7])
+def test_evidence_of_every_timing_is_the_density_of_the_dense_gaussian(hidden):
+    model, data = trained()
+    model.ratio[1] = 3.0
+    seen = torch.rand(FRAMES, CHANNELS, generator=torch.Generator().manual_seed(hidden)) >= 0.3
+    seen = seen if hidden else torch.ones_like(seen)
+    x = data.values[:2] * seen
+    for timing in (Timing(FRAMES - 1.0), Timing(FRAMES + 4.0)):
+        mean, covariance, noise = joint(model, timing)
+        s = seen.T.flatten()
+        law = torch.distributions.MultivariateNormal(
+            mean[s], (covariance + torch.diag(noise))[s][:, s]
+        )
+        (view,) = sights(model.primitive, [timing], model.ratio, seen)
+        found = model._evidence(view.sums(view.errors(x), 2, FRAMES))
+        torch.testing.assert_close(found, law.log_prob(x.mT.flatten(1)[:, s]), rtol=1e-9, atol=1e-7)
+
+
+def test_draws_are_made_when_they_are_asked_for_and_by_the_seed():
+    model, data = trained()
+    made = []
+    with seeded(3):
+        first = model.forecast(whole(data[[1]].first(8)), None, horizon=22, draws=5)
+        made.append(torch.randn(1))
+    with seeded(3):
+        again = model.forecast(whole(data[[1]].first(8)), None, horizon=22, draws=5)
+        assert torch.equal(again.draws, again.draws)
+        made.append(torch.randn(1))
+    assert torch.equal(*made)
+    torch.testing.assert_close(
+        first.affine(torch.tensor(2.0), torch.tensor(1.0)).draws, 2 * again.draws + 1
+    )
 
 
 def test_draws_have_the_exact_moments():

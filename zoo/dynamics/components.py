@@ -2,49 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from zoo.mixtures import Deferred
+
 __all__ = ["Components", "Paths", "alike", "ramp", "resample"]
+
+Draw = Callable[[int], Tensor]
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Mean and variance of the path at every time, with joint draws."""
+    """Mean and variance of the path at every time; ``draw`` gives so many joint draws of it."""
 
     mean: Float[Tensor, "sequence time channel"]
     variance: Float[Tensor, "sequence time channel"]
-    draws: Float[Tensor, "sample sequence time channel"]
+    draw: Draw
 
 
 @dataclass(frozen=True)
 class Components:
-    """Moments of every component and draws of the mixture: draw j is of component j mod count."""
+    """Moments of every component; draw j of the mixture is of component j mod their number."""
 
     mean: Float[Tensor, "component sequence time channel"]
     variance: Float[Tensor, "component sequence time channel"]
-    draws: Float[Tensor, "sample sequence time channel"]
+    pieces: list[tuple[int, Tensor, Tensor, Draw]] = field(default_factory=list)
+    begin: int = 0
 
     @classmethod
-    def empty(
-        cls, count: int, draws: int, like: Float[Tensor, "sequence time channel"]
-    ) -> Components:
+    def empty(cls, count: int, like: Float[Tensor, "sequence time channel"]) -> Components:
         """Room for ``count`` components of movements shaped ``like``."""
         mean = like.new_zeros(count, *like.shape)
-        return cls(mean, torch.zeros_like(mean), like.new_zeros(draws, *like.shape))
+        return cls(mean, torch.zeros_like(mean))
 
     @classmethod
     def of(cls, parts: list[Paths]) -> Components:
         """One component, the movements of ``parts`` one after the other."""
-        return cls(
-            torch.cat([p.mean for p in parts])[None],
-            torch.cat([p.variance for p in parts])[None],
-            torch.cat([p.draws for p in parts], dim=1),
-        )
+        whole = cls.empty(1, torch.cat([p.mean for p in parts]))
+        for i, part in enumerate(parts):
+            whole.put(torch.tensor([i]), torch.ones(1, 1, dtype=torch.bool), part)
+        return whole
 
     def put(
         self,
@@ -53,16 +55,28 @@ class Components:
         paths: Paths,
     ) -> None:
         """Fill in ``paths`` of the movements ``rows`` where they are the component chosen."""
-        count = len(chosen)
         for component, here in enumerate(chosen):
             self.mean[component, rows[here]] = paths.mean[here]
             self.variance[component, rows[here]] = paths.variance[here]
-            self.draws[component::count, rows[here]] = paths.draws[component::count, here]
+            if bool(here.any()):
+                self.pieces.append((component, rows[here], here, paths.draw))
 
     def after(self, frames: int) -> Components:
         """Without the first ``frames`` frames."""
         mean, variance = self.mean[:, :, frames:], self.variance[:, :, frames:]
-        return Components(mean, variance, self.draws[:, :, frames:])
+        return replace(self, mean=mean, variance=variance, begin=self.begin + frames)
+
+    def draws(self, count: int) -> Deferred:
+        """Joint draws of the mixture, made when they are asked for."""
+
+        def make() -> Tensor:
+            draws = self.mean.new_zeros(count, *self.mean.shape[1:])
+            for component, rows, here, draw in self.pieces:
+                some = draws[component :: len(self.mean)]
+                some[:, rows] = draw(len(some))[:, here, self.begin :]
+            return draws
+
+        return Deferred((count, *self.mean.shape[1:]), make)
 
 
 def resample(
@@ -83,6 +97,9 @@ def resample(
 
 def alike(seen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Rows of the movements that have the same entries, with these."""
+    if bool((seen == seen[:1]).all()):
+        yield torch.arange(len(seen)), seen[0]
+        return
     patterns, index = torch.unique(seen.flatten(1), dim=0, return_inverse=True)
     for i, pattern in enumerate(patterns):
         yield (index == i).nonzero()[:, 0], pattern.view(seen.shape[1:])

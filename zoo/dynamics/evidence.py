@@ -24,14 +24,14 @@ class Weights:
     """
 
     mean: Float[Tensor, "sequence channel kernel"]
-    covariance: Float[Tensor, "sequence channel kernel kernel"]
+    covariance: Float[Tensor, "#sequence channel kernel kernel"]
     noise: Float[Tensor, " channel"]
     prior: Float[Tensor, " channel"]
     log_evidence: Float[Tensor, " channel"]
 
 
 def conjugate_weights(
-    precision: Float[Tensor, "sequence #channel kernel kernel"],
+    precision: Float[Tensor, "#sequence #channel kernel kernel"],
     linear: Float[Tensor, "sequence channel kernel"],
     square: Float[Tensor, "sequence channel"],
     count: Float[Tensor, "sequence #channel"],
@@ -48,7 +48,8 @@ def conjugate_weights(
     β = (vectors.mT @ linear[..., None])[..., 0]
     total = count.sum(0).clamp_min(1)
     grid = torch.logspace(-9, 3, GRID, dtype=s.dtype, device=s.device) * s.mean()
-    scores = torch.stack([_profile(s, β, square, total, λ) for λ in grid])
+    energy = β.square().sum(0, keepdim=True) if len(s) == 1 else β.square()
+    scores = torch.stack([_profile(s, energy, square.sum(0), len(β), total, λ) for λ in grid])
     λ = grid[scores.argmax(0)]
     shrunk = s + λ[:, None]
     energy = (square - (β.square() / shrunk).sum(-1)).clamp_min(0)
@@ -64,8 +65,10 @@ def conjugate_weights(
     )
 
 
-def _profile(s: Tensor, β: Tensor, square: Tensor, total: Tensor, λ: Tensor) -> Tensor:
+def _profile(
+    s: Tensor, explained: Tensor, square: Tensor, sequences: int, total: Tensor, λ: Tensor
+) -> Tensor:
     """Log evidence of every channel at λ with the best σ², up to a constant."""
-    energy = (square - (β.square() / (s + λ)).sum(-1)).clamp_min(0).sum(0)
-    volume = ((s + λ) / λ).log().sum((0, -1)) / 2
+    energy = square - (explained / (s + λ)).sum((0, -1))
+    volume = ((s + λ) / λ).log().sum((0, -1)) / 2 * (sequences / len(s))
     return -total / 2 * (energy / total).clamp_min(FLOOR).log() - volume

@@ -13,7 +13,7 @@ from zoo.dynamics.evidence import FLOOR, conjugate_weights
 from zoo.dynamics.imitation import locally_weighted_regression, target_force
 from zoo.dynamics.population import Population, estimate
 from zoo.dynamics.rollout import Primitive, Timing
-from zoo.dynamics.sums import Movements, Sums, of_weights, square_after, sums_of, uniform
+from zoo.dynamics.sums import Movements, Sums, of_weights, square_after, sums_of
 from zoo.dynamics.timing import anchors, timings_of
 
 __all__ = ["Learned", "Learning", "learn"]
@@ -64,31 +64,31 @@ def learn(
         [anchors(primitive, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)]
     )
     floor = _floor(movements, timings, primitive.kernels)
-    parameters, uncertainty = _weights(primitive, learning, movements, timings, starts)
-    fit = _residuals(primitive, movements, timings, parameters, uncertainty)
-    whole = sums_of(primitive, fit.ratio, movements, timings)
-    begun = sums_of(primitive, fit.ratio, [_begun(x, seen) for x, seen in movements], timings)
-    shrinkage = _shrinkage(fit, whole, begun, floor)
+    ratios = _ratios(learning)
+    shape = (-1, values.shape[2])
+    every, begun = sums_of(primitive, ratios[:, None].expand(shape), movements, timings)
+    if learning == "lwr":
+        parameters, uncertainty = _local_weights(primitive, movements, timings, starts)
+    else:
+        own = int((ratios == NOISE_OF[learning]).nonzero())
+        parameters, uncertainty = _weights(every.at(own), starts)
+    fit, winner = _residuals(every, ratios, parameters, uncertainty)
+    whole, early = every.of_channels(winner), begun.of_channels(winner)
+    shrinkage = _shrinkage(fit, whole, early, floor)
     population = estimate(fit.parameters, fit.uncertainty, shrinkage, floor)
     if not all(bool(seen.all()) for _, seen in movements):
         population = _refined(population, whole, fit.noise, shrinkage, floor)
     return Learned(population, fit.noise, fit.ratio, shrinkage, tuple(timings))
 
 
-def _weights(
-    primitive: Primitive,
-    learning: Learning,
-    movements: Movements,
-    timings: list[Timing],
-    starts: Tensor,
-) -> tuple[Tensor, Tensor]:
+def _ratios(learning: Learning) -> Float[Tensor, " ratio"]:
+    """Those of the residuals, and that under which the weights are learned."""
+    own = [NOISE_OF[learning]] if learning in NOISE_OF else []
+    return torch.tensor([*RATIOS, *(r for r in own if r not in RATIOS)], dtype=torch.float64)
+
+
+def _weights(sums: Sums, starts: Tensor) -> tuple[Tensor, Tensor]:
     """θ of every movement and its mean posterior covariance."""
-    if learning == "lwr":
-        weights = _local_weights(primitive, movements, timings, starts)
-        size = starts.shape[2] + weights.shape[2]
-        none = starts.new_zeros(starts.shape[1], size, size)
-        return torch.cat([starts, weights], dim=2), none
-    sums = sums_of(primitive, uniform(NOISE_OF[learning], movements), movements, timings)
     precision, linear = of_weights(sums, starts)
     count, square = (sums.count - 3).clamp_min(0), square_after(sums, starts)
     found = conjugate_weights(precision, linear, square, count, sums.log_volume)
@@ -98,38 +98,26 @@ def _weights(
 
 
 def _residuals(
-    primitive: Primitive,
-    movements: Movements,
-    timings: list[Timing],
-    parameters: Tensor,
-    uncertainty: Tensor,
-) -> _Fit:
+    every: Sums, ratios: Tensor, parameters: Tensor, uncertainty: Tensor
+) -> tuple[_Fit, Int[Tensor, " channel"]]:
     """σ² and ρ of every channel that make the residuals of the roll-outs most probable."""
     noises, scores = [], []
-    for ratio in RATIOS:
-        sums = sums_of(primitive, uniform(ratio, movements), movements, timings)
+    for i in range(len(RATIOS)):
+        sums = every.at(i)
         count, square = (sums.count - 3).clamp_min(0), square_after(sums, parameters)
         noise = (square.sum(0) / count.sum(0).clamp_min(1)).clamp_min(FLOOR)
         each = square / noise / 2 + count / 2 * noise.log() + sums.log_volume
         noises.append(noise)
         scores.append(-each.sum(0))
     winner, rows = torch.stack(scores).argmax(0), torch.arange(len(scores[0]))
-    ratio_of = torch.tensor(RATIOS, dtype=parameters.dtype)[winner]
-    return _Fit(parameters, uncertainty, torch.stack(noises)[winner, rows], ratio_of)
-
-
-def _begun(x: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """A movement of which only the first quarter is seen."""
-    early = torch.arange(len(x))[:, None] < max(2, len(x) // 4)
-    return x, seen & early
+    noise = torch.stack(noises)[winner, rows]
+    return _Fit(parameters, uncertainty, noise, ratios[winner]), winner
 
 
 def _local_weights(
-    primitive: Primitive,
-    movements: Movements,
-    timings: list[Timing],
-    starts: Tensor,
-) -> Float[Tensor, "sequence channel kernel"]:
+    primitive: Primitive, movements: Movements, timings: list[Timing], starts: Tensor
+) -> tuple[Tensor, Tensor]:
+    """θ of every movement by (61), which has no posterior covariance."""
     rows = []
     for (x, seen), timing, start in zip(movements, timings, starts, strict=True):
         _, target = target_force(x, start[:, 2], primitive.system(timing))
@@ -137,7 +125,9 @@ def _local_weights(
         kernels = primitive.kernel_values(len(x), timing, normalised=False)[:-1]
         gate = primitive.gate(len(x), timing)[:-1]
         rows.append(locally_weighted_regression(kernels, target, scale=gate, mask=usable).T)
-    return torch.stack(rows)
+    parameters = torch.cat([starts, torch.stack(rows)], dim=2)
+    channels, size = parameters.shape[1:]
+    return parameters, parameters.new_zeros(channels, size, size)
 
 
 def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
@@ -153,36 +143,34 @@ def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
     return floor
 
 
-def _shrinkage(fit: _Fit, whole: Sums, begun: Sums, floor: Tensor) -> float:
+def _shrinkage(fit: _Fit, whole: Sums, early: Sums, floor: Tensor) -> float:
     """The shrinkage that best foretells movements left out; 0.5 of fewer than three movements."""
     if len(fit.parameters) < 3:
         return 0.5
-    return max(SHRINKAGES, key=lambda share: _foretold(fit, whole, begun, share, floor))
+    return max(SHRINKAGES, key=lambda share: _foretold(fit, whole, early, share, floor))
 
 
-def _foretold(fit: _Fit, whole: Sums, begun: Sums, shrinkage: float, floor: Tensor) -> float:
+def _foretold(fit: _Fit, whole: Sums, early: Sums, shrinkage: float, floor: Tensor) -> float:
     """Log density of the later three quarters of movements left out, given their first."""
     count, score = len(fit.parameters), 0.0
     folds = torch.arange(count) % min(FOLDS, count)
     for fold in folds.unique():
-        out = folds == fold
-        population = estimate(fit.parameters[~out], fit.uncertainty, shrinkage, floor)
-        for i in out.nonzero()[:, 0].tolist():
-            score += float(population.log_evidence(*_likelihood(whole, fit.noise, i)))
-            score -= float(population.log_evidence(*_likelihood(begun, fit.noise, i)))
+        rows = (folds == fold).nonzero()[:, 0]
+        population = estimate(fit.parameters[folds != fold], fit.uncertainty, shrinkage, floor)
+        for sums, sign in ((whole, 1), (early, -1)):
+            evidence = population.log_evidence(*_likelihood(sums.of_movements(rows), fit.noise))
+            score += sign * float(evidence.sum())
     return score
 
 
-def _likelihood(sums: Sums, noise: Tensor, i: int) -> tuple[Tensor, Tensor]:
-    return sums.precision[i] / noise[:, None, None], sums.linear[i] / noise[:, None]
+def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:
+    return sums.precision / noise[:, None, None], sums.linear / noise[:, None]
 
 
 def _refined(
     population: Population, whole: Sums, noise: Tensor, shrinkage: float, floor: Tensor
 ) -> Population:
     """The population again, from parameters that it completed itself where frames were missing."""
-    rows = range(len(whole.linear))
-    parts = [population.condition(*_likelihood(whole, noise, i)) for i in rows]
-    spread = [p.private @ p.private.mT + p.factors @ p.factors.mT for p in parts]
-    means = torch.stack([p.mean for p in parts])
-    return estimate(means, torch.stack(spread).mean(0), shrinkage, floor)
+    part = population.condition(*_likelihood(whole, noise))
+    spread = part.private @ part.private.mT + part.factors @ part.factors.mT
+    return estimate(part.mean, spread.mean(0), shrinkage, floor)

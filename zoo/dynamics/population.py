@@ -64,9 +64,18 @@ class Population:
         self, design: Float[Tensor, "*channel time parameter"]
     ) -> tuple[Float[Tensor, "sequence time channel"], Float[Tensor, "sequence time channel"]]:
         """Mean and variance of design θ_c at every time."""
-        spread = [(design @ part).square().sum(-1) for part in (self.factors, self.private)]
-        mean = _times(design, self.mean)
-        return mean.mT, (spread[0] + spread[1]).expand_as(mean).mT
+        root = torch.cat([self.factors, self.private], dim=-1)
+        spread = torch.linalg.vector_norm(design @ root, dim=-1).square()
+        mean = self.path(design)
+        return mean.mT, spread.expand_as(mean).mT
+
+    def path(
+        self, design: Float[Tensor, "*channel time parameter"]
+    ) -> Float[Tensor, "sequence channel time"]:
+        """Mean of design θ_c at every time."""
+        if design.ndim == 3 and len(design) > 1:
+            return _times(design, self.mean)
+        return self.mean @ design.view(design.shape[-2:]).mT
 
     def sample(self, count: int) -> Float[Tensor, "sample sequence channel parameter"]:
         """Joint draws of θ, from torch's default generator."""
@@ -124,6 +133,8 @@ class _Solved:
 
 def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
     v, factors = prior.private, prior.factors
+    if precision.ndim == 4 and len(precision) == 1:
+        precision = precision[0]
     eye = torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
     root = torch.linalg.cholesky(eye + v.mT @ precision @ v)
     private = torch.linalg.solve_triangular(root, v.mT, upper=False).mT
@@ -131,9 +142,11 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
     keep = eye - gain @ precision
     error = linear - _times(precision, prior.mean)
     shared_eye = torch.eye(factors.shape[-1], dtype=v.dtype, device=v.device)
-    shared = shared_eye + (factors.mT @ precision @ keep @ factors).sum(-3)
+    kept = keep @ factors
+    informed = (precision @ kept).flatten(-3, -2)
+    shared = shared_eye + factors.flatten(-3, -2).mT @ informed
     shared_root = torch.linalg.cholesky((shared + shared.mT) / 2)
-    shared_linear = torch.einsum("...cpr,...cp->...r", keep @ factors, error)
+    shared_linear = (error.flatten(-2)[..., None, :] @ kept.flatten(-3, -2))[..., 0, :]
     log_volume = root.diagonal(dim1=-2, dim2=-1).log().sum((-1, -2))
     return _Solved(
         error=error,
@@ -148,7 +161,11 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
     )
 
 
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+def _times(
+    matrix: Float[Tensor, "*sequence channel p q"], vector: Float[Tensor, "*batch #channel q"]
+) -> Float[Tensor, "*batch channel p"]:
+    if matrix.ndim == 3:
+        return torch.einsum("cpq,...cq->...cp", matrix, vector)
     product: Tensor = matrix @ vector[..., None]
     return product[..., 0]
 

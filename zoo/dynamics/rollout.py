@@ -1,4 +1,4 @@
-r"""A movement primitive as a linear-Gaussian model of a whole movement, seen in part.
+r"""A movement primitive as a linear-Gaussian model of a whole movement.
 
 With θ = (y₁, ẏ₁, g, w), white forces ε and white observation noise η::
 
@@ -15,13 +15,13 @@ from functools import lru_cache
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from zoo.dynamics.dmp import Response, Transformation, discrete_basis, phase, rhythmic_basis
-from zoo.dynamics.imitation import stationary_variance, trajectory_matrix
+from zoo.dynamics.imitation import trajectory_matrix
 
-__all__ = ["Primitive", "Sight", "Timing", "path_noise", "roll_out", "sight"]
+__all__ = ["Primitive", "Timing", "roll_out"]
 
 
 @dataclass(frozen=True)
@@ -86,80 +86,3 @@ def roll_out(primitive: Primitive, frames: int, timing: Timing) -> Float[Tensor,
     """R of ``frames`` frames."""
     response = Response.of(primitive.system(timing), frames)
     return trajectory_matrix(response, primitive.basis(frames, timing)[:-1])
-
-
-@lru_cache(maxsize=128)
-def path_noise(
-    primitive: Primitive, frames: int, timing: Timing
-) -> Float[Tensor, "frame frame_minus_1"]:
-    """N of ``frames`` frames."""
-    system = primitive.system(timing)
-    still = torch.zeros(2, frames - 1, dtype=torch.float64)
-    forces = torch.eye(frames - 1, dtype=torch.float64)
-    scale = stationary_variance(system) ** 0.5
-    return Response.of(system, frames).product(still, forces)[0].div(scale)
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What the seen frames of every channel say, in units of σ; unseen frames must hold 0.
-
-    The channel axis has length 1 where all channels are seen alike.
-
-    θ has the likelihood exp(−½ θᵀ ``precision`` θ + θᵀ ``project`` x); given θ the path is
-    ``design`` θ + ``follow`` x, with variance ``variance``; ``whiten`` x is white at θ = 0.
-    ``noise`` is N.
-    """
-
-    noise: Float[Tensor, "time time_minus_1"]
-
-    precision: Float[Tensor, "*channel parameter parameter"]
-    project: Float[Tensor, "*channel parameter time"]
-    design: Float[Tensor, "*channel time parameter"]
-    follow: Float[Tensor, "*channel time time"]
-    variance: Float[Tensor, "*channel time"]
-    whiten: Float[Tensor, "*channel time time"]
-    log_volume: Float[Tensor, "*channel"]
-    count: Float[Tensor, "*channel"]
-
-
-def sight(
-    design: Float[Tensor, "time parameter"],
-    noise: Float[Tensor, "time time_minus_1"],
-    ratio: Float[Tensor, " channel"],
-    seen: Bool[Tensor, "time channel"],
-) -> Sight:
-    """What the seen frames of every channel say; channels seen alike are worked out once."""
-    keys = torch.cat([ratio[:, None], seen.T.to(ratio)], dim=1)
-    patterns, index = torch.unique(keys, dim=0, return_inverse=True)
-    found = [_sight(design, noise, p[0], p[1:].bool()) for p in patterns]
-    rows = slice(None) if len(found) == 1 else index
-    fields = {k: torch.stack([f[k] for f in found])[rows] for k in found[0]}
-    return Sight(noise=noise, **fields)
-
-
-def _sight(design: Tensor, noise: Tensor, ratio: Tensor, seen: Tensor) -> dict[str, Tensor]:
-    frames = len(seen)
-    r, n = design[seen], noise[seen]
-    eye = torch.eye(len(r), dtype=design.dtype)
-    root = torch.linalg.cholesky(n @ n.T + ratio * eye)
-    unroot = torch.linalg.solve_triangular(root, eye, upper=False)
-    white = unroot @ r
-    answer = unroot @ n @ noise.T
-    follow = _spread(answer.T @ unroot, seen)
-    return {
-        "precision": white.T @ white,
-        "project": _spread(white.T @ unroot, seen),
-        "design": design - follow @ design,
-        "follow": follow,
-        "variance": (noise.square().sum(1) - answer.square().sum(0)).clamp_min(0),
-        "whiten": torch.nn.functional.pad(_spread(unroot, seen), (0, 0, 0, frames - len(r))),
-        "log_volume": root.diagonal().log().sum(),
-        "count": seen.sum().to(design.dtype),
-    }
-
-
-def _spread(columns: Tensor, seen: Tensor) -> Tensor:
-    wide = columns.new_zeros(len(columns), len(seen))
-    wide[:, seen] = columns
-    return wide

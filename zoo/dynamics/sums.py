@@ -1,59 +1,183 @@
-"""Sufficient statistics of demonstrations under the linear-Gaussian model of a movement."""
+"""What observed entries say of a movement's parameters, under the linear-Gaussian model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from zoo.dynamics.rollout import Primitive, Timing, path_noise, roll_out, sight
+from zoo.dynamics.kalman import PathNoise, Smoother
+from zoo.dynamics.rollout import Primitive, Timing, roll_out
 
-__all__ = ["Movements", "Sums", "of_weights", "square_after", "sums_of", "uniform"]
+__all__ = [
+    "Movements",
+    "Sight",
+    "Sums",
+    "of_weights",
+    "sights",
+    "square_after",
+    "squares",
+    "sums_of",
+]
 
 Movements = list[tuple[Tensor, Tensor]]
+COLUMNS = 1000
+SEQUENCE, CHANNEL = (-4, -3, -2, -2, -2), (-3, -2, -1, -1, -1)
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Sufficient statistics of every demonstration in units of σ; see :class:`Sight`."""
+    """θ of a movement has the likelihood exp(−½ θᵀ ``precision`` θ + ``linear`` θ), in units of σ.
 
-    precision: Float[Tensor, "sequence #channel parameter parameter"]
-    linear: Float[Tensor, "sequence channel parameter"]
-    square: Float[Tensor, "sequence channel"]
-    count: Float[Tensor, "sequence #channel"]
-    log_volume: Float[Tensor, "sequence #channel"]
+    ``square`` is ‖L⁻¹x‖², ``log_volume`` log |L|, L Lᵀ the covariance of x given θ. The sequence
+    axis of ``precision`` has length 1 where all movements are observed alike, its channel axis
+    where all channels are.
+    """
+
+    precision: Float[Tensor, "*ratio #sequence #channel parameter parameter"]
+    linear: Float[Tensor, "*ratio sequence channel parameter"]
+    square: Float[Tensor, "*ratio sequence channel"]
+    count: Float[Tensor, "*ratio sequence #channel"]
+    log_volume: Float[Tensor, "*ratio sequence #channel"]
+
+    @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All of them, in order."""
+        return tuple(getattr(self, f.name) for f in fields(self))
+
+    def at(self, ratio: int) -> Sums:
+        """Those under one of several noise ratios."""
+        return Sums(*(part[ratio] for part in self.parts))
+
+    def of_channels(self, ratio: Int[Tensor, " channel"]) -> Sums:
+        """Those under one of several noise ratios, each channel its own."""
+        if bool((ratio == ratio[0]).all()):
+            return self.at(int(ratio[0]))
+        channel = torch.arange(len(ratio))
+        wide = [_expanded(p, a, len(ratio)) for p, a in zip(self.parts, CHANNEL, strict=True)]
+        first = [p.movedim(a, 1)[ratio, channel] for p, a in zip(wide, CHANNEL, strict=True)]
+        return Sums(*(p.movedim(0, a) for p, a in zip(first, CHANNEL, strict=True)))
+
+    def of_movements(self, rows: Int[Tensor, " some"]) -> Sums:
+        """Those of some movements."""
+        precision, *rest = self.parts
+        alike = len(precision) == 1
+        return Sums(precision if alike else precision[rows], *(part[rows] for part in rest))
 
 
-def uniform(ratio: float, movements: Movements) -> Float[Tensor, " channel"]:
-    """One noise ratio for every channel."""
-    return torch.full((movements[0][0].shape[1],), ratio, dtype=torch.float64)
+@dataclass(frozen=True)
+class Sight:
+    """A timing and observed entries: how they see movements, which hold 0 elsewhere.
+
+    ``smoother`` has a pattern for every channel, or one for all. Columns are movements and channels
+    as it takes them.
+    """
+
+    smoother: Smoother
+    design: Float[Tensor, "time parameter"]
+
+    def errors(
+        self, x: Float[Tensor, "sequence time channel"]
+    ) -> Float[Tensor, "*ratio pattern time column"]:
+        """L⁻¹x; the same for all timings of one tempo."""
+        return self.smoother.whiten(_columns(x, self._alike))
+
+    def sums(
+        self, errors: Float[Tensor, "*ratio pattern time column"], count: int, frames: int
+    ) -> Sums:
+        """What the first ``frames`` frames of ``count`` movements say, of their :meth:`errors`."""
+        r, e = self._white[..., :frames, :], errors[..., :frames, :]
+        volume = self.smoother.log_root[..., :frames].sum(-1)
+        known = self.smoother.seen[..., :frames].sum(-1).to(e)
+        return Sums(
+            precision=(r.mT @ r).unsqueeze(-4),
+            linear=_rows(r.mT @ e, count),
+            square=squares(e, count),
+            count=known.unsqueeze(-2).expand(*known.shape[:-1], count, -1),
+            log_volume=volume.unsqueeze(-2).expand(*volume.shape[:-1], count, -1),
+        )
+
+    def follow(
+        self, x: Float[Tensor, "*batch time channel"]
+    ) -> Float[Tensor, "*batch time channel"]:
+        """E[n | x] at θ = 0."""
+        flat = x.flatten(0, -3)
+        columns = self.smoother.follow(_columns(flat, self._alike))
+        return _rows(columns, len(flat)).mT.view_as(x)
+
+    @cached_property
+    def given(self) -> Float[Tensor, "pattern time parameter"]:
+        """What θ adds to E[y | θ, x], the rest of which follows x."""
+        seen = self.smoother.seen[..., None]
+        return self.design - self.smoother.follow(self.design * seen)
+
+    @cached_property
+    def _white(self) -> Float[Tensor, "*ratio pattern time parameter"]:
+        return self.smoother.whiten(self.design * self.smoother.seen[..., None])
+
+    @property
+    def _alike(self) -> bool:
+        return self.smoother.seen.shape[-2] == 1
+
+
+def sights(
+    primitive: Primitive,
+    timings: Sequence[Timing],
+    ratio: Float[Tensor, "*ratio channel"],
+    seen: Bool[Tensor, "time channel"],
+) -> list[Sight]:
+    """The same entries in the light of every timing; timings of one tempo share the smoother."""
+    frames, channels = seen.shape
+    keys = torch.cat([ratio.reshape(-1, channels), seen.to(ratio)]).T
+    first, index = keys[:1], None
+    if bool((keys != first).any()):
+        first, index = torch.unique(keys, dim=0, return_inverse=True)
+    ratios = first[:, :-frames].T.reshape(*ratio.shape[:-1], len(first))
+    known = first[:, -frames:].bool()
+
+    def smoother(unit: float) -> Smoother:
+        noise = PathNoise(primitive.system(Timing(unit)), frames)
+        found = Smoother.of(noise, ratios, known)
+        return found if index is None else found.at(index)
+
+    shared = {unit: smoother(unit) for unit in {t.unit for t in timings}}
+    return [Sight(shared[t.unit], roll_out(primitive, frames, t)) for t in timings]
 
 
 def sums_of(
     primitive: Primitive,
-    ratio: Tensor,
+    ratio: Float[Tensor, "*ratio channel"],
     movements: Movements,
-    timings: list[Timing],
-) -> Sums:
-    """Sums of every movement, stacked over movements."""
-    parts = [
-        _sum(primitive, ratio, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)
-    ]
-    channels = max(p[0].shape[0] for p in parts)
-    wide = [[a.expand(max(channels, len(a)), *a.shape[1:]) for a in p] for p in parts]
-    return Sums(*(torch.stack(column) for column in zip(*wide, strict=True)))
+    timings: Sequence[Timing],
+) -> tuple[Sums, Sums]:
+    """Sums of every movement, and those of its first quarter alone."""
+    parts, order = [], []
+    for rows in _groups(movements, timings):
+        order += rows
+        seen = movements[rows[0]][1]
+        (view,) = sights(primitive, [timings[rows[0]]], ratio, seen)
+        frames, begun = len(seen), max(2, len(seen) // 4)
+        x = torch.stack([movements[i][0] for i in rows]) * seen
+        found = []
+        for part in x.split(max(1, COLUMNS // x.shape[2])):
+            errors, n = view.errors(part), len(part)
+            found.append((view.sums(errors, n, frames), view.sums(errors, n, begun)))
+        parts.append([_joined(each) for each in zip(*found, strict=True)])
+    back = torch.tensor(order).argsort()
+    whole, early = (_together(each, back) for each in zip(*parts, strict=True))
+    return whole, early
 
 
-def _sum(
-    primitive: Primitive, ratio: Tensor, x: Tensor, seen: Tensor, timing: Timing
-) -> tuple[Tensor, ...]:
-    design, noise = roll_out(primitive, len(x), timing), path_noise(primitive, len(x), timing)
-    view = sight(design, noise, ratio, seen)
-    known = (x * seen).T[..., None]
-    square = (view.whiten @ known).square().sum((-1, -2))
-    return view.precision, (view.project @ known)[..., 0], square, view.count, view.log_volume
+def squares(
+    errors: Float[Tensor, "*ratio pattern time column"], count: int
+) -> Float[Tensor, "*ratio sequence channel"]:
+    """‖L⁻¹x‖² of every movement and channel."""
+    size = torch.linalg.vector_norm(errors, dim=-2, keepdim=True)
+    return _rows(size, count)[..., 0].square()
 
 
 def of_weights(sums: Sums, starts: Tensor) -> tuple[Tensor, Tensor]:
@@ -67,3 +191,57 @@ def square_after(sums: Sums, θ: Tensor) -> Tensor:
     count = θ.shape[-1]
     curve = (θ * (sums.precision[..., :count, :count] @ θ[..., None])[..., 0]).sum(-1)
     return (sums.square - 2 * (θ * sums.linear[..., :count]).sum(-1) + curve).clamp_min(0)
+
+
+def _groups(movements: Movements, timings: Sequence[Timing]) -> list[list[int]]:
+    """Movements of one timing with the same entries observed."""
+    found: dict[tuple[Timing, bytes], list[int]] = {}
+    for i, ((_, seen), timing) in enumerate(zip(movements, timings, strict=True)):
+        found.setdefault((timing, seen.numpy().tobytes()), []).append(i)
+    return list(found.values())
+
+
+def _joined(parts: Sequence[Sums]) -> Sums:
+    """Movements observed alike, one after the other."""
+    precision, *rest = zip(*(p.parts for p in parts), strict=True)
+    return Sums(precision[0], *(torch.cat(r, a) for r, a in zip(rest, SEQUENCE[1:], strict=True)))
+
+
+def _together(parts: Sequence[Sums], order: Tensor) -> Sums:
+    """Movements observed in several ways, in ``order``."""
+    if len(parts) == 1:
+        return parts[0]
+    channels = max(p.precision.shape[-3] for p in parts)
+    wide = [_full(p, p.linear.shape[-3], channels) for p in parts]
+    rows = zip(*wide, strict=True)
+    return Sums(
+        *(torch.cat(r, a).index_select(a, order) for r, a in zip(rows, SEQUENCE, strict=True))
+    )
+
+
+def _full(sums: Sums, sequences: int, channels: int) -> list[Tensor]:
+    """All parts with their sequence axis, and all but ``linear`` and ``square`` of ``channels``."""
+    found = []
+    for part, axis, channel in zip(sums.parts, SEQUENCE, CHANNEL, strict=True):
+        wide = _expanded(part, axis, sequences)
+        found.append(_expanded(wide, channel, max(channels, wide.shape[channel])))
+    return found
+
+
+def _expanded(part: Tensor, axis: int, size: int) -> Tensor:
+    shape = list(part.shape)
+    shape[axis] = size
+    return part.expand(shape)
+
+
+def _columns(x: Tensor, alike: bool) -> Float[Tensor, "pattern time column"]:
+    """Movements and channels as columns; channels as patterns where they are not observed alike."""
+    columns: Tensor = x.transpose(0, 1).flatten(1)[None] if alike else x.permute(2, 1, 0)
+    return columns
+
+
+def _rows(columns: Tensor, count: int) -> Float[Tensor, "*ratio sequence channel row"]:
+    if columns.shape[-3] > 1:
+        return columns.movedim(-1, -3)
+    rows: Tensor = columns.squeeze(-3).unflatten(-1, (count, -1)).movedim(-3, -1)
+    return rows

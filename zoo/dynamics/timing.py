@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from zoo.dynamics.evidence import FLOOR
-from zoo.dynamics.rollout import Primitive, Timing, path_noise, roll_out, sight
-from zoo.dynamics.sums import Movements, of_weights, sums_of, uniform
+from zoo.dynamics.rollout import Primitive, Timing, roll_out
+from zoo.dynamics.sums import Movements, of_weights, sights, squares, sums_of
 
 __all__ = ["anchors", "expected", "period_of", "phases", "tempos", "timings_of"]
 
@@ -19,6 +19,7 @@ PHASES = 16
 TEMPOS = (1.0, 0.8, 0.9, 1.1, 1.25)
 FINE = (1.0, *(1.25 ** (k / 10) for k in range(-10, 11) if k))
 TEMPO_SPREAD = 0.03
+RATIO = 1e-2
 
 
 def anchors(
@@ -122,11 +123,12 @@ def _aligned(primitive: Primitive, movements: Movements, period: float) -> list[
 def _pooled(
     primitive: Primitive, movements: Movements, timings: list[Timing]
 ) -> Float[Tensor, "channel kernel"]:
-    sums = sums_of(primitive, uniform(1e-2, movements), movements, timings)
+    ratio = movements[0][0].new_full(movements[0][0].shape[1:], RATIO)
+    sums, _ = sums_of(primitive, ratio, movements, timings)
     pairs = zip(movements, timings, strict=True)
     starts = torch.stack([anchors(primitive, x, seen, t) for (x, seen), t in pairs])
     precision, linear = of_weights(sums, starts)
-    total = precision.sum(0)
+    total = precision.sum(0) * (len(linear) / len(precision))
     size = total.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None].clamp_min(FLOOR)
     ridge = 1e-6 * size * torch.eye(total.shape[-1], dtype=total.dtype)
     weights: Tensor = torch.linalg.solve(total + ridge, linear.sum(0)[..., None])
@@ -136,12 +138,9 @@ def _pooled(
 def _nearest(
     primitive: Primitive, x: Tensor, seen: Tensor, choices: list[Timing], template: Tensor
 ) -> Timing:
-    noise = path_noise(primitive, len(x), choices[0])
-    ratio = uniform(1e-2, [(x, seen)])
-    whiten = sight(roll_out(primitive, len(x), choices[0]), noise, ratio, seen).whiten
     start = anchors(primitive, x, seen, choices[0])
-    costs = []
-    for choice in choices:
-        path = roll_out(primitive, len(x), choice) @ torch.cat([start, template], dim=1).T
-        costs.append((whiten @ ((x - path) * seen).T[..., None]).square().sum())
-    return choices[int(torch.stack(costs).argmin())]
+    θ = torch.cat([start, template], dim=1)
+    paths = torch.stack([roll_out(primitive, len(x), choice) @ θ.T for choice in choices])
+    (view,) = sights(primitive, choices[:1], x.new_full(x.shape[1:], RATIO), seen)
+    errors = view.errors((x - paths) * seen)
+    return choices[int(squares(errors, len(choices)).sum(-1).argmin())]

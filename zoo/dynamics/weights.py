@@ -134,12 +134,15 @@ class Weights:
         return turned.mT
 
 
-def superposed(terms: Sequence[tuple[Basis, Weights, Float[Tensor, " time"]]], draws: int) -> Paths:
+def superposed(terms: Sequence[tuple[Basis, Weights, Float[Tensor, " time"]]]) -> Paths:
     """Sum of independent paths, each counting a part at every frame."""
     parts = [(basis, weights, part[:, None]) for basis, weights, part in terms]
     moments = [weights.moments(basis) for basis, weights, _ in parts]
     mean = sum(p * m for (_, _, p), (m, _) in zip(parts, moments, strict=True))
     variance = sum(p.square() * v for (_, _, p), (_, v) in zip(parts, moments, strict=True))
-    path = sum(p * basis.path(weights.sample(draws)) for basis, weights, p in parts)
     centre = torch.as_tensor(mean)
-    return Paths(centre, torch.as_tensor(variance).expand_as(centre), torch.as_tensor(path))
+
+    def draw(count: int) -> Tensor:
+        return torch.as_tensor(sum(p * b.path(w.sample(count)) for b, w, p in parts))
+
+    return Paths(centre, torch.as_tensor(variance).expand_as(centre), draw)

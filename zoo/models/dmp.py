@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -18,9 +19,11 @@ from zoo.dynamics.alignment import durations
 from zoo.dynamics.components import Components, Paths, alike, ramp, resample
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.imitation import trajectory_matrix
+from zoo.dynamics.kalman import PathNoise
 from zoo.dynamics.learning import Learning, learn
 from zoo.dynamics.population import Population
-from zoo.dynamics.rollout import Primitive, Sight, Timing, path_noise, roll_out, sight
+from zoo.dynamics.rollout import Primitive, Timing, roll_out
+from zoo.dynamics.sums import Sight, Sums, sights
 from zoo.dynamics.timing import TEMPOS, expected
 from zoo.errors import NotFittedError
 from zoo.prediction import Predictive
@@ -36,7 +39,7 @@ class Case:
     """Movements with the same entries seen and one timing: p(θ | x) of each."""
 
     population: Population
-    view: Sight
+    sight: Sight
     timing: Timing
     x: Float[Tensor, "sequence time channel"]
 
@@ -164,7 +167,7 @@ class DMP(nn.Module):
             shared = torch.einsum("cpr,sr->scp", self.factors, a)
             θ = self.mean + shared + torch.einsum("cpq,scq->scp", self.private, δ)
             path = θ @ roll_out(self.primitive, frames, timing).mT
-            y = path.mT + self.noise * (path_noise(self.primitive, frames, timing) @ ε)
+            y = path.mT + self.noise * self._noise(frames, timing).paths(ε)
             noise = dist.Normal(y, self.noise * self.ratio.sqrt())
             if batch.movement_mask is not None:
                 noise = noise.mask(batch.movement_mask)
@@ -174,20 +177,19 @@ class DMP(nn.Module):
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Fresh roll-outs of the weights, goal and first state that the movements have."""
         frames = batch.values.shape[1]
-        timings, blank = self._whole(frames), torch.zeros_like(_seen(batch)[0])
 
         def render(case: Case) -> Paths:
-            view = self._sight(blank, case.timing)
-            return self._paths([(view.design, case.population)], view, case.x, draws)
+            design = roll_out(self.primitive, frames, case.timing)
+            return self._paths([(design, case.population)], self._noise(frames, case.timing))
 
-        parts = self._mixture(batch.values, _seen(batch), timings, 1, render, draws)
-        return self._as_predictive(parts)
+        parts = self._mixture(batch.values, _seen(batch), self._whole(frames), 1, render)
+        return self._as_predictive(parts, draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The paths given the entries seen."""
         timings = self._whole(batch.values.shape[1])
         count = 1 if len(timings) == 1 else COMPONENTS
-        return self._as_predictive(self._filled(batch.values, _seen(batch), timings, count, draws))
+        return self._as_predictive(self._filled(batch.values, _seen(batch), timings, count), draws)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -198,8 +200,8 @@ class DMP(nn.Module):
         values, seen = functional.pad(batch.values, pad), functional.pad(_seen(batch), pad)
         known = batch.values.shape[1]
         count = 1 if len(self.units) == 1 else COMPONENTS
-        parts = self._filled(values, seen, self._timings(known), count, draws)
-        return self._as_predictive(parts.after(known))
+        parts = self._filled(values, seen, self._timings(known), count)
+        return self._as_predictive(parts.after(known), draws)
 
     def generate(
         self,
@@ -225,26 +227,21 @@ class DMP(nn.Module):
 
         def mix(i: int, case: Case) -> Paths:
             timing = Timing(case.timing.unit * duration, case.timing.offset)
-            view = self._sight(torch.zeros(frames, len(self.noise), dtype=torch.bool), timing)
             terms = [(self._part(frames, timing, 1 - blend, begin=True), case.population)]
             if other:
                 phase = Timing(timing.unit, other[i].timing.offset)
                 terms.append((self._part(frames, phase, blend, begin=False), other[i].population))
             if goal is not None:
                 terms[-1] = (terms[-1][0], self._moved(terms[-1][1], goal[i : i + 1]))
-            still = case.x.new_zeros(1, frames, len(self.noise))
-            return self._paths(terms, view, still, draws)
+            return self._paths(terms, self._noise(frames, timing))
 
         parts = [mix(i, case) for i, case in enumerate(self._demonstrated(batch, len(batch)))]
-        return self._as_predictive(Components.of(parts))
+        return self._as_predictive(Components.of(parts), draws)
 
     def _filled(
-        self, values: Tensor, seen: Tensor, timings: list[Timing], count: int, draws: int
+        self, values: Tensor, seen: Tensor, timings: list[Timing], count: int
     ) -> Components:
-        def render(case: Case) -> Paths:
-            return self._paths([(case.view.design, case.population)], case.view, case.x, draws)
-
-        return self._mixture(values, seen, timings, count, render, draws)
+        return self._mixture(values, seen, timings, count, self._follow)
 
     def _mixture(
         self,
@@ -253,70 +250,86 @@ class DMP(nn.Module):
         timings: list[Timing],
         count: int,
         render: Callable[[Case], Paths],
-        draws: int,
     ) -> Components:
         """A mixture over timings, resampled to ``count`` components (1: the likeliest timing).
 
         Residuals of joints go together, so that all joints count as one: evidence a joint.
         """
         self._check_fitted()
-        parts = Components.empty(count, draws, values)
+        parts = Components.empty(count, values)
         for rows, mask in alike(seen):
             x = values[rows] * mask
-            views = [self._sight(mask, timing) for timing in timings]
-            evidence = torch.stack([self._evidence(view, x) for view in views])
+            views = sights(self.primitive, timings, self.ratio, mask)
+            sums = self._sums(views, timings, x)
+            evidence = torch.stack([self._evidence(s) for s in sums])
             picks = resample(evidence / len(self.noise), count)
             for i in picks.unique().tolist():
                 some = (picks == i).any(0)
-                case = self._case(views[i], timings[i], x[some])
+                case = self._case(views[i], timings[i], x[some], sums[i].of_movements(some))
                 parts.put(rows[some], picks[:, some] == i, render(case))
         return parts
 
-    def _case(self, view: Sight, timing: Timing, x: Tensor) -> Case:
-        precision, linear = self._likelihood(view, x)
-        return Case(self.population.condition(precision, linear), view, timing, x)
+    def _sums(self, views: list[Sight], timings: list[Timing], x: Tensor) -> list[Sums]:
+        """What the movements say of θ in the light of every timing."""
+        errors: dict[float, Tensor] = {}
+        for view, timing in zip(views, timings, strict=True):
+            if timing.unit not in errors:
+                errors[timing.unit] = view.errors(x)
+        pairs = zip(views, timings, strict=True)
+        return [v.sums(errors[t.unit], len(x), x.shape[1]) for v, t in pairs]
+
+    def _case(self, view: Sight, timing: Timing, x: Tensor, sums: Sums) -> Case:
+        population = self.population.condition(*self._likelihood(sums))
+        return Case(population, view, timing, x)
 
     def _demonstrated(self, batch: Batch, count: int) -> list[Case]:
         """The likeliest timing of every movement and its posterior."""
         if len(batch) not in (1, count):
             raise ValueError(f"onto has {len(batch)} movements; 1 or {count} are needed")
-        timings, cases = self._whole(batch.values.shape[1]), []
-        for x, mask in zip(batch.values, _seen(batch), strict=True):
-            views = [self._sight(mask, timing) for timing in timings]
-            known = (x * mask)[None]
-            best = int(torch.stack([self._evidence(view, known) for view in views]).argmax())
-            cases.append(self._case(views[best], timings[best], known))
-        return cases if len(cases) == count else cases * count
+        timings, cases = self._whole(batch.values.shape[1]), dict[int, Case]()
+        for rows, mask in alike(_seen(batch)):
+            x = batch.values[rows] * mask
+            views = sights(self.primitive, timings, self.ratio, mask)
+            sums = self._sums(views, timings, x)
+            best = torch.stack([self._evidence(s) for s in sums]).argmax(0)
+            for j, (row, i) in enumerate(zip(rows.tolist(), best.tolist(), strict=True)):
+                one = torch.tensor([j])
+                cases[row] = self._case(views[i], timings[i], x[one], sums[i].of_movements(one))
+        return [cases[i if len(batch) == count else 0] for i in range(count)]
 
-    def _likelihood(self, view: Sight, x: Tensor) -> tuple[Tensor, Tensor]:
-        linear = (view.project @ x.mT[..., None])[..., 0]
+    def _likelihood(self, sums: Sums) -> tuple[Tensor, Tensor]:
         variance = self.noise.square()
-        return view.precision / variance[:, None, None], linear / variance[:, None]
+        return sums.precision / variance[:, None, None], sums.linear / variance[:, None]
 
-    def _evidence(self, view: Sight, x: Tensor) -> Float[Tensor, " sequence"]:
-        """Log density of the frames seen, up to what all timings have in common."""
-        white = (view.whiten @ x.mT[..., None])[..., 0] / self.noise[:, None]
-        volume = view.log_volume.expand_as(self.noise).sum()
-        fit = self.population.log_evidence(*self._likelihood(view, x))
-        return fit - white.square().sum((-1, -2)) / 2 - volume
+    def _evidence(self, sums: Sums) -> Float[Tensor, " sequence"]:
+        """log p(x) of the entries observed, given the timing."""
+        variance = self.noise.square()
+        white = -(sums.square / variance + sums.count * (2 * math.pi * variance).log()) / 2
+        at_zero = (white - sums.log_volume).sum(-1)
+        return at_zero + self.population.log_evidence(*self._likelihood(sums))
 
-    def _paths(
-        self, terms: list[tuple[Tensor, Population]], view: Sight, x: Tensor, draws: int
-    ) -> Paths:
-        """Sum of design θ over ``terms``, with the residual of ``view``; draws by Matheron."""
-        residual = (view.follow @ x.mT[..., None])[..., 0].mT
-        moments = [population.moments(design) for design, population in terms]
-        mean = residual + sum(m for m, _ in moments)
-        variance = view.variance.mT * self.noise.square() + sum(v for _, v in moments)
-        shape = (draws, len(x), len(self.noise))
-        ε = torch.randn(*shape, view.noise.shape[1], 1, dtype=x.dtype)
-        η = torch.randn(*shape, view.noise.shape[0], 1, dtype=x.dtype)
-        force = view.noise @ ε
-        force = force - view.follow @ (force + self.ratio.sqrt()[:, None, None] * η)
-        path = residual.mT + self.noise[:, None] * force[..., 0]
-        for design, population in terms:
-            path = path + (design @ population.sample(draws)[..., None])[..., 0]
-        return Paths(mean, variance, path.mT)
+    def _follow(self, case: Case) -> Paths:
+        """The paths given the entries observed; draws by Matheron."""
+        view, σ, root = case.sight, self.noise, self.ratio.sqrt()
+        noise, seen = self._noise(case.x.shape[1], case.timing), view.smoother.seen.mT
+
+        def residual(count: int) -> Tensor:
+            force = noise.draw(count, case.x)
+            pseudo = (force + root * torch.randn_like(force)) * seen
+            return view.follow(case.x) + σ * (force - view.follow(pseudo))
+
+        mean, variance, draw = _sum([(view.given, case.population)])
+        spread = view.smoother.variance.mT * σ.square()
+        return Paths(mean + view.follow(case.x), variance + spread, lambda n: draw(n) + residual(n))
+
+    def _paths(self, terms: list[tuple[Tensor, Population]], noise: PathNoise) -> Paths:
+        """Sum of design θ over ``terms``, with new forces."""
+        mean, variance, draw = _sum(terms)
+        spread = noise.variance[:, None] * self.noise.square()
+        return Paths(mean, variance + spread, lambda n: draw(n) + self.noise * noise.draw(n, mean))
+
+    def _noise(self, frames: int, timing: Timing) -> PathNoise:
+        return PathNoise(self.primitive.system(timing), frames)
 
     def _part(self, frames: int, timing: Timing, weight: Tensor, *, begin: bool) -> Tensor:
         """R of a movement whose goal and weights count ``weight`` at every step."""
@@ -338,11 +351,6 @@ class DMP(nn.Module):
         shift[..., 2] = goal
         return population.affine(scale, shift)
 
-    def _sight(self, seen: Tensor, timing: Timing) -> Sight:
-        frames = len(seen)
-        design = roll_out(self.primitive, frames, timing)
-        return sight(design, path_noise(self.primitive, frames, timing), self.ratio, seen)
-
     def _whole(self, frames: int) -> list[Timing]:
         """Possible timings of a complete movement of ``frames`` frames."""
         return [Timing(frames - 1.0)] if self.config.kind == "discrete" else self._timings(frames)
@@ -354,10 +362,13 @@ class DMP(nn.Module):
         going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
         return going or [max(timings, key=lambda t: t.unit)]
 
-    def _as_predictive(self, parts: Components) -> Predictive:
+    def _as_predictive(self, parts: Components, draws: int) -> Predictive:
         noise = (self.noise * self.ratio.sqrt()).expand_as(parts.mean)
         return Predictive(
-            location=parts.mean, noise=noise, epistemic=parts.variance.sqrt(), draws=parts.draws
+            location=parts.mean,
+            noise=noise,
+            epistemic=parts.variance.sqrt(),
+            draws=parts.draws(draws),
         )
 
     def _white(self, name: str, *shape: int) -> Tensor:
@@ -372,6 +383,20 @@ class DMP(nn.Module):
     def _check_fitted(self) -> None:
         if not len(self.units):
             raise NotFittedError("dmp has not been trained: zoo.fit(model, train) comes first")
+
+
+def _sum(
+    terms: list[tuple[Tensor, Population]],
+) -> tuple[Tensor, Tensor, Callable[[int], Tensor]]:
+    """Mean and variance of the sum of design θ over ``terms``, and its draws."""
+    moments = [population.moments(design) for design, population in terms]
+
+    def draw(count: int) -> Tensor:
+        parts = [(d @ p.sample(count)[..., None])[..., 0].mT for d, p in terms]
+        return torch.stack(parts).sum(0)
+
+    mean, variance = (torch.stack(m).sum(0) for m in zip(*moments, strict=True))
+    return mean, variance, draw
 
 
 def _seen(batch: Batch) -> Bool[Tensor, "sequence time channel"]:

@@ -178,5 +178,5 @@ class PcaDmp(nn.Module):
             location=latent.location @ w.T + μ,
             noise=self._noise(self._white),
             epistemic=None if latent.epistemic is None else self._spread(latent.epistemic),
-            draws=None if latent.draws is None else latent.draws @ w.T + μ,
+            draws=latent.redrawn(lambda z: z @ w.T + μ, len(w)),
         )

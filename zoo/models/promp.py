@@ -208,9 +208,9 @@ class ProMP(nn.Module):
             if goal is not None:
                 basis, weights, part = terms.pop()
                 terms.append((basis, self._moved(weights, basis, goal[i] - self.offset), part))
-            return superposed(terms, draws)
+            return superposed(terms)
 
-        return self._as_predictive(Components.of([mix(i) for i in range(len(batch))]))
+        return self._as_predictive(Components.of([mix(i) for i in range(len(batch))]), draws)
 
     def basis(self, frames: int, timing: Timing) -> Basis:
         """φ and S of ``frames`` frames."""
@@ -252,13 +252,13 @@ class ProMP(nn.Module):
 
         Residuals of channels go together, so that all channels count as one: evidence a channel.
         """
-        parts = Components.empty(count, draws, values)
+        parts = Components.empty(count, values)
         for views in self._sights(values, seen, timings):
             for i, some, chosen in self._chosen(views, count):
                 view, whole = views[i].only(some), torch.ones(len(views[i].seen), dtype=self.dtype)
                 posterior = view.posterior(self.weights, self.noise.square())
-                parts.put(view.rows, chosen, superposed([(view.basis, posterior, whole)], draws))
-        return self._as_predictive(parts.after(after))
+                parts.put(view.rows, chosen, superposed([(view.basis, posterior, whole)]))
+        return self._as_predictive(parts.after(after), draws)
 
     def _sights(self, values: Tensor, seen: Tensor, timings: list[Timing]) -> Iterator[list[View]]:
         """Movements with the same entries seen, in the light of every timing."""
@@ -307,10 +307,11 @@ class ProMP(nn.Module):
         going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
         return going or timings[-1:]
 
-    def _as_predictive(self, parts: Components) -> Predictive:
+    def _as_predictive(self, parts: Components, draws: int) -> Predictive:
+        paths = parts.draws(draws)
         return Predictive(
             location=self.offset + parts.mean,
             noise=self.noise.expand_as(parts.mean),
             epistemic=parts.variance.sqrt(),
-            draws=self.offset + parts.draws,
+            draws=paths.map(lambda y: self.offset + y, paths.shape),
         )
