@@ -22,6 +22,8 @@ from zoo.catalogue import CATALOGUE
 from zoo.codehash import hashes
 from zoo.datasets.records import Sequences
 from zoo.errors import OtherTrainingError, RunExistsError, RunLockedError
+from zoo.experiments.kept import timed
+from zoo.experiments.kept import trained as trained_once
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = movements()[:6]
@@ -283,6 +285,24 @@ def test_every_member_of_an_ensemble_is_compared(tmp_path: Path) -> None:
         zoo.fit_ensemble(members(2), TRAIN, run_dir=tmp_path)
     narrow = zoo.fit_ensemble(members(2, latent_dim=1), TRAIN, run_dir=tmp_path, overwrite=True)
     assert narrow.members[1].model.config.latent_dim == 1
+
+
+def test_an_experiment_says_what_it_reuses_and_keeps_its_duration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Equal data, settings and code: taken from disk. Anything else: trained beside it."""
+    monkeypatch.chdir(tmp_path)
+    with timed() as first:
+        whole = trained_once(vae(), TRAIN, "E0", "six movements")
+    assert first == [whole.seconds] and "reused" not in capsys.readouterr().err
+    with timed() as again:
+        assert bits(trained_once(vae(), TRAIN, "E0", "six movements")) == bits(whole)
+    assert again == first and "vae (six-movements): reused from runs/E0" in capsys.readouterr().err
+    trained_once(vae(latent_dim=1), TRAIN, "E0", "six movements")
+    trained_once(vae(movements()), movements(), "E0", "six movements")
+    trained_once(zoo.create("mean", TRAIN), TRAIN, "E0", "six movements")
+    assert "reused" not in capsys.readouterr().err
+    assert len(list((tmp_path / "runs" / "E0").iterdir())) == 3
 
 
 SLOW = """

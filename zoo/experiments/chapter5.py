@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from scipy.signal import find_peaks
 
 from zoo.datasets.cmu_mocap import load
 from zoo.datasets.records import Sequences
-from zoo.fitting import fit
+from zoo.experiments.kept import trained
 from zoo.run import Run, create
 from zoo.strategies import Svi
 
@@ -96,12 +95,9 @@ def fitted(
 ) -> Run:
     """A model trained on ``data``; a trained one is kept under runs/chapter-5."""
     assembly = create(name, data, seed=0, **settings)
-    if not isinstance(assembly.inference, Svi):
-        return fit(assembly, data)
-    if quick:
+    if quick and isinstance(assembly.inference, Svi):
         assembly = create(name, data, seed=0, **{**settings, "epochs": 5})
-    folder = Path("runs") / "chapter-5" / f"{name}-{label}{'-quick' if quick else ''}"
-    return fit(assembly, data, run_dir=folder, resume="auto", progress=progress)
+    return trained(assembly, data, "chapter-5", label, progress=progress)
 
 
 def without(data: Sequences, channels: Sequence[str]) -> Sequences:

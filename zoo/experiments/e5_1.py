@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,8 +10,8 @@ from numpy.typing import NDArray
 
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
+from zoo.experiments.kept import trained
 from zoo.experiments.result import Result
-from zoo.fitting import fit
 from zoo.run import Run, create
 from zoo.strategies import Svi
 
@@ -63,12 +62,9 @@ def _alone(run: Run, data: Sequences) -> float:
 def fitted(name: str, data: Sequences, label: str, quick: bool, progress: bool) -> Run:
     """A model of one movement, kept under runs/E5.1 where it is trained."""
     assembly = create(name, data, seed=SEED)
-    if not isinstance(assembly.inference, Svi):
-        return fit(assembly, data)
-    if quick:
+    if quick and isinstance(assembly.inference, Svi):
         assembly = create(name, data, seed=SEED, epochs=20)
-    folder = Path("runs") / "E5.1" / f"{name}-{label.replace(' ', '-')}{'-quick' if quick else ''}"
-    return fit(assembly, data, run_dir=folder, resume="auto", progress=progress)
+    return trained(assembly, data, "E5.1", label, progress=progress)
 
 
 def _errors(runs: list[Run], data: Sequences) -> tuple[Column, Column]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from torch import Tensor
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments import e5_1
+from zoo.experiments.kept import trained
 from zoo.experiments.result import Result
-from zoo.fitting import fit
 from zoo.run import Run, create
 
 if TYPE_CHECKING:
@@ -56,14 +55,8 @@ def run(*, quick: bool, progress: bool) -> Result:
 
 def _without(data: Sequences, label: str, quick: bool, progress: bool) -> Run:
     settings: dict[str, Any] = {"penalty": OFF} | ({"epochs": 20} if quick else {})
-    folder = f"{label.replace(' ', '-')}{'-quick' if quick else ''}"
-    return fit(
-        create("ae-dmp", data, seed=SEED, **settings),
-        data,
-        run_dir=Path("runs") / "E5.2" / folder,
-        resume="auto",
-        progress=progress,
-    )
+    assembly = create("ae-dmp", data, seed=SEED, **settings)
+    return trained(assembly, data, "E5.2", label, progress=progress)
 
 
 def _latent(run: Run, data: Sequences) -> tuple[Column, Column]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from torch import Tensor
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.experiments import e5_1
+from zoo.experiments.kept import trained
 from zoo.experiments.result import Result
-from zoo.fitting import fit
 from zoo.player import posture_strips
 from zoo.prediction import Prediction
 from zoo.run import Run, create
@@ -51,13 +50,8 @@ def run(*, quick: bool, progress: bool) -> Result:
 
 def _single(data: Sequences, quick: bool, progress: bool) -> Run:
     settings: dict[str, Any] = {"epochs": 5} if quick else {}
-    return fit(
-        create("vae-dmp-single", data, seed=SEED, latent_dim=5, **settings),
-        data,
-        run_dir=Path("runs") / "E5.6" / f"vae-dmp-single{'-quick' if quick else ''}",
-        resume="auto",
-        progress=progress,
-    )
+    assembly = create("vae-dmp-single", data, seed=SEED, latent_dim=5, **settings)
+    return trained(assembly, data, "E5.6", "punching", progress=progress)
 
 
 def _result(

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
+from zoo.experiments.kept import trained
 from zoo.experiments.result import Result
-from zoo.fitting import fit
 from zoo.run import Run, create
 
 if TYPE_CHECKING:
@@ -60,13 +59,9 @@ def run(*, quick: bool, progress: bool) -> Result:
 def _fitted(
     name: str, data: Sequences, latent: int, label: str, quick: bool, progress: bool
 ) -> Run:
-    folder = Path("runs") / "E6.1" / f"{name}-{label.replace(' ', '-')}{'-quick' if quick else ''}"
-    assembly = (
-        create(name, data, seed=SEED, latent_dim=latent, epochs=5)
-        if quick
-        else create(name, data, seed=SEED, latent_dim=latent)
-    )
-    return fit(assembly, data, run_dir=folder, resume="auto", progress=progress)
+    settings: dict[str, Any] = {"epochs": 5} if quick else {}
+    assembly = create(name, data, seed=SEED, latent_dim=latent, **settings)
+    return trained(assembly, data, "E6.1", label, progress=progress)
 
 
 def _errors(run: Run, data: Sequences) -> NDArray[np.float64]:

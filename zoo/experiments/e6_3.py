@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +11,8 @@ from torch import Tensor
 
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
+from zoo.experiments.kept import trained
 from zoo.experiments.result import Result
-from zoo.fitting import fit
 from zoo.nn.metric import sensitivity
 from zoo.player import posture_map
 from zoo.prediction import Predictive
@@ -61,15 +60,8 @@ def fitted(
     **settings: Any,
 ) -> Run:
     """A model of ``latent`` dimensions, kept under runs/E6.3 where it is trained."""
-    folder = label.replace(", ", "-").replace(" ", "-").lower()
     chosen = {**settings, "latent_dim": latent} | ({"epochs": 5} if quick else {})
-    return fit(
-        create(name, data, seed=SEED, **chosen),
-        data,
-        run_dir=Path("runs") / "E6.3" / f"{folder}{'-quick' if quick else ''}",
-        resume="auto",
-        progress=progress,
-    )
+    return trained(create(name, data, seed=SEED, **chosen), data, "E6.3", label, progress=progress)
 
 
 def box(latents: Tensor, points: int) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from zoo.datasets.records import Sequences
 from zoo.datasets.robot_arm import end_effector, load, load_held_out
+from zoo.experiments.kept import trained
 from zoo.experiments.result import Result
 from zoo.fitting import fit
 from zoo.prediction import Prediction
@@ -57,9 +57,8 @@ def run(*, quick: bool, progress: bool) -> Result:
 
 def _fitted(data: Sequences, seed: int, quick: bool, progress: bool) -> Run:
     settings = {**SETTINGS, "epochs": 20} if quick else SETTINGS
-    folder = Path("runs") / "E6.5" / f"seed-{seed}{'-quick' if quick else ''}"
     assembly = create("vae-dmp", data, seed=seed, **settings)
-    return fit(assembly, data, run_dir=folder, resume="auto", progress=progress)
+    return trained(assembly, data, "E6.5", f"seed {seed}", progress=progress)
 
 
 def _aimed(run: Run, demonstration: Sequences, optimal: Sequences) -> list[Prediction]:

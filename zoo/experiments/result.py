@@ -18,6 +18,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import Markdown
 
 from zoo.errors import UnknownNameError
+from zoo.experiments.kept import timed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +41,8 @@ class Result:
     """Rows of numbers with their reference, prose that says what they show, and a figure.
 
     ``cards`` are the sentences that model cards quote; ``source`` says what the data are.
+    ``seconds`` are those of the command, ``training_seconds`` those of its trainings, whenever
+    they were.
     """
 
     title: str
@@ -54,6 +57,7 @@ class Result:
     identifier: str = ""
     command: str = ""
     seconds: float = 0.0
+    training_seconds: float | None = None
 
     def markdown(self) -> str:
         """The table and the findings."""
@@ -72,6 +76,7 @@ class Result:
             "command": self.command or f"zoo experiment {self.identifier}",
             "seed": self.seed,
             "seconds": round(self.seconds, 1),
+            **self._training(),
             "columns": list(self.columns),
             "rows": [list(r) for r in self.rows],
             "findings": list(self.findings),
@@ -83,6 +88,10 @@ class Result:
             "versions": {n: version(n) for n in ("movezoo", "torch", "pyro-ppl", "numpy")},
             "machine": {"cores": os.cpu_count(), "python": platform.python_version()},
         }
+
+    def _training(self) -> dict[str, float]:
+        known = self.training_seconds
+        return {} if known is None else {"training_seconds": round(known, 1)}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The table for a terminal."""
@@ -146,7 +155,8 @@ def run_experiment(
         raise UnknownNameError(f"no experiment {identifier!r}; nearest: {', '.join(near)}")
     run: Callable[..., Result] = import_module(EXPERIMENTS[identifier].module).run
     began = time.monotonic()
-    found = run(quick=quick, progress=progress)
+    with timed() as times:
+        found = replace(run(quick=quick, progress=progress), training_seconds=sum(times))
     return write_result(found, identifier, output, time.monotonic() - began)
 
 
