@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from zoo.fitting import fit
     from zoo.player import play
     from zoo.prediction import Prediction
+    from zoo.questions import Setup
     from zoo.run import Run, create, evaluate, load
 
 __version__ = "0.1.0"
@@ -28,6 +29,7 @@ __all__ = [
     "Prediction",
     "Run",
     "Sequences",
+    "Setup",
     "Table",
     "__version__",
     "card",
@@ -48,6 +50,7 @@ _HOME = {
     "Prediction": "zoo.prediction",
     "Run": "zoo.run",
     "Sequences": "zoo.datasets.records",
+    "Setup": "zoo.questions",
     "Table": "zoo.evaluation.table",
     "card": "zoo.cards",
     "create": "zoo.run",

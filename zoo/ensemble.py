@@ -20,10 +20,11 @@ from zoo.exchange import check_unseen, question
 from zoo.fitting import fit
 from zoo.mixtures import pooled
 from zoo.prediction import Prediction, Recalibration
+from zoo.questions import Setup
 from zoo.run import Run
 from zoo.rundir import Resume
 from zoo.storage import load_run
-from zoo.tasks import Method, Setup, corrections
+from zoo.tasks import Method, corrections
 
 __all__ = ["Ensemble", "fit_ensemble"]
 

@@ -8,6 +8,7 @@ __all__ = [
     "NoJointSamplesError",
     "NoSpreadError",
     "NoiseDivergenceWarning",
+    "NotCalibratedWarning",
     "NotCapableError",
     "NotFittedError",
     "OtherTrainingError",
@@ -17,6 +18,7 @@ __all__ = [
     "TooManyItemsError",
     "TrainingError",
     "TrainingWarning",
+    "UnanswerableError",
     "UnknownNameError",
     "UnlikeUnitsWarning",
     "WindowsWarning",
@@ -30,7 +32,11 @@ class UnknownNameError(KeyError, ValueError):
         return str(self.args[0])
 
 
-class NotCapableError(TypeError):
+class UnanswerableError(Exception):
+    """A model has no honest answer to a task, at all or on the data at hand."""
+
+
+class NotCapableError(UnanswerableError, TypeError):
     """A task that the chosen model has no honest answer to."""
 
 
@@ -74,7 +80,7 @@ class RunLockedError(RuntimeError):
     """Another process is writing in the folder."""
 
 
-class MovementLengthError(ValueError):
+class MovementLengthError(UnanswerableError, ValueError):
     """Movements are longer or shorter than those that a model can answer for."""
 
 
@@ -96,6 +102,10 @@ class PosteriorCollapseWarning(UserWarning):
 
 class UnlikeUnitsWarning(UserWarning):
     """Channels of several units are scaled by one number."""
+
+
+class NotCalibratedWarning(UserWarning):
+    """A task has no answer on the calibration data, so that its bands stay as they are."""
 
 
 class WindowsWarning(UserWarning):

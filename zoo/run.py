@@ -21,7 +21,8 @@ from zoo.exchange import Answer, Exchange, check_timing, check_unseen, question
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.prediction import Prediction, Predictive, Recalibration
-from zoo.tasks import Method, Setup, Trained, corrections, trials
+from zoo.questions import Setup
+from zoo.tasks import Method, Trained, corrections, posed
 from zoo.types import Batch, Posterior
 
 __all__ = ["Run", "create", "evaluate", "load"]
@@ -176,7 +177,10 @@ class Run:
         tasks: Sequence[str] | None = None,
         setup: Setup | None = None,
     ) -> Run:
-        """Fit and keep a correction of every spread on movements that training never saw."""
+        """Fit and keep a correction of every spread on movements that training never saw.
+
+        ``setup`` says how the tasks will be posed, such as which channels will be missing.
+        """
         check_unseen(data, self.trained_on["fingerprints"], "calibration")
         self.recalibrations.update(corrections(self, data, method, tasks, setup))
         return self
@@ -239,11 +243,14 @@ def evaluate(
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
 ) -> Table:
-    """Score every task that the model can do, or those named, on data it never saw."""
+    """Score every task that the model can do, or those named, on data it never saw.
+
+    A task without an answer on these data is a line that says why; the others are scored.
+    """
     check_unseen(data, run.trained_on["fingerprints"], "evaluation")
-    posed = trials(run, data, tasks, setup)
-    scores = [(t.task, score(t.prediction, t.truth, t.mask, t.groups)) for t in posed]
-    return Table.of(run.name, data.name, scores)
+    found, refused = posed(run, data, tasks, setup)
+    scores = [(t.task, score(t.prediction, t.truth, t.mask, t.groups)) for t in found]
+    return Table.of(run.name, data.name, scores, refused)
 
 
 def load(folder: str | Path) -> Run:

@@ -10,8 +10,9 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotCapableError, UnknownNameError
 from zoo.player import Player, play
+from zoo.questions import Setup
 from zoo.run import Run
-from zoo.tasks import Setup, beginning
+from zoo.tasks import beginning
 from zoo.workflow import open_run
 
 __all__ = ["screen", "screen_run"]

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, TypeVar
 
-import torch
 from torch import Tensor
 
 from zoo.datasets.records import Groups, Pairs, Sequences
-from zoo.errors import UnknownNameError
+from zoo.errors import (
+    NotCalibratedWarning,
+    UnanswerableError,
+    UnknownNameError,
+)
 from zoo.evaluation.calibration import recalibrate
 from zoo.prediction import Prediction, Recalibration
+from zoo.questions import Setup, hide_joints, hide_section
 
 __all__ = [
     "TASKS",
     "Method",
     "Predictor",
-    "Setup",
     "Trained",
     "Trial",
     "beginning",
     "corrections",
-    "hide_joints",
-    "hide_section",
+    "posed",
     "trials",
 ]
 
@@ -69,36 +72,6 @@ class Trained(Predictor, Protocol):
     def trained_on(self) -> dict[str, Any]:
         """``name`` and ``fingerprints`` of the training data."""
         ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class Setup:
-    """How the tasks are posed: frames seen by a forecast, share of joints or frames hidden."""
-
-    seen: int | None = None
-    horizon: int | None = None
-    hidden: float = 0.2
-    draws: int = 200
-    seed: int = 0
-
-    def frames(self, data: Sequences, *, beyond: bool = False) -> tuple[int, int]:
-        """Frames seen and frames to forecast; by default a seventh is seen (10 of 70).
-
-        The forecast ends where the shortest movement does, unless it may go ``beyond``.
-        """
-        shortest = int(data.lengths.min())
-        seen = max(2, shortest // 7) if self.seen is None else self.seen
-        horizon = shortest - seen if self.horizon is None else self.horizon
-        if seen < 1 or seen > shortest:
-            raise ValueError(f"a forecast sees 1 to {shortest} frames of these data; got {seen}")
-        if horizon < 1:
-            raise ValueError(f"a forecast needs a horizon of at least 1 frame; got {horizon}")
-        if seen + horizon > shortest and not beyond:
-            raise ValueError(
-                f"a forecast of {horizon} frames after {seen} needs {seen + horizon} frames; "
-                f"the shortest movement has {shortest}"
-            )
-        return seen, horizon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +121,7 @@ def _impute_joints(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Tri
 
 def _impute_section(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
     movements = _expect(data, Sequences)
-    holed = hide_section(movements, setup.hidden)
+    holed = hide_section(movements, setup.section)
     prediction = run.impute(holed, draws=setup.draws, seed=setup.seed)
     return _trial("impute section", prediction, movements, movements.mask & ~holed.mask)
 
@@ -168,7 +141,37 @@ def trials(
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
 ) -> list[Trial]:
-    """Pose every task that the run's model can do, or those named, on ``data``."""
+    """Pose every task that the run's model can do, or those named, on ``data``.
+
+    A task without an answer on these data is left out, see :func:`posed`.
+    """
+    return posed(run, data, tasks, setup)[0]
+
+
+def posed(
+    run: Predictor,
+    data: Pairs | Sequences,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> tuple[list[Trial], dict[str, str]]:
+    """The answers to every task that the model can do, or to those named, and why others have none.
+
+    Where no task has an answer the first one's UnanswerableError is raised.
+    """
+    found: list[Trial] = []
+    refused: dict[str, UnanswerableError] = {}
+    for name in _names(run, tasks):
+        try:
+            found.append(TASKS[name][1](run, data, setup or Setup()))
+        except UnanswerableError as error:
+            refused[name] = error
+    if refused and not found:
+        raise next(iter(refused.values()))
+    return found, {name: str(error) for name, error in refused.items()}
+
+
+def _names(run: Predictor, tasks: Sequence[str] | None) -> list[str]:
+    """Tasks to pose; those that the model has not are named."""
     names = [t for t, (need, _) in TASKS.items() if need in run.capabilities]
     if tasks is not None:
         unknown = [t for t in tasks if t not in names]
@@ -177,7 +180,7 @@ def trials(
                 f"no task {unknown[0]!r} for this model; it has {', '.join(names)}"
             )
         names = list(tasks)
-    return [TASKS[name][1](run, data, setup or Setup()) for name in names]
+    return names
 
 
 def corrections(
@@ -187,10 +190,17 @@ def corrections(
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
 ) -> dict[str, Recalibration]:
-    """A correction of the spread for every task, fitted on ``data``."""
+    """A correction of the spread for every task, fitted on ``data``.
+
+    A task without an answer on these data stays as it is, with a NotCalibratedWarning.
+    """
+    found, refused = posed(run, data, tasks, setup)
+    for task, reason in refused.items():
+        told = f"{task} has no answer on the calibration data and stays uncalibrated: {reason}"
+        warnings.warn(told, NotCalibratedWarning, stacklevel=3)
     return {
         trial.task: recalibrate(method, trial.prediction.raw, trial.truth, trial.mask, trial.groups)
-        for trial in trials(run, data, tasks, setup)
+        for trial in found
         if trial.prediction.has_spread
     }
 
@@ -201,32 +211,6 @@ def beginning(data: Sequences, seen: int, horizon: int) -> Sequences:
     if data.controls is None:
         return known
     return replace(known, controls=data.controls[:, : seen + horizon])
-
-
-def hide_joints(data: Sequences, share: float, *, seed: int = 0) -> Sequences:
-    """The movements with a random ``share`` of the channels (at least one) missing throughout."""
-    count = len(data.channels)
-    hidden = min(max(1, round(share * count)), count - 1)
-    if hidden < 1:
-        raise ValueError("hiding joints needs at least two channels")
-    pick = torch.randperm(count, generator=torch.Generator().manual_seed(seed))[:hidden]
-    keep = torch.ones(count, dtype=torch.bool)
-    keep[pick] = False
-    return _masked(data, data.mask & keep)
-
-
-def hide_section(data: Sequences, share: float) -> Sequences:
-    """The movements with a ``share`` of the frames missing in the middle, all channels."""
-    time = torch.arange(data.values.shape[1])
-    length = data.lengths[:, None]
-    width = (share * length).round().clamp(min=1)
-    start = (length - width) / 2
-    inside = (time >= start) & (time < start + width)
-    return _masked(data, data.mask & ~inside[..., None])
-
-
-def _masked(data: Sequences, mask: Tensor) -> Sequences:
-    return replace(data, mask=mask, values=torch.where(mask, data.values, 0.0))
 
 
 def _trial(task: str, prediction: Prediction, truth: Sequences, mask: Tensor) -> Trial:

@@ -13,8 +13,8 @@ import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
 from zoo.prediction import Prediction
+from zoo.questions import hide_joints
 from zoo.run import Run
-from zoo.tasks import hide_joints
 
 DEGREE = 180 / math.pi
 CLOSE = {torch.float32: 1e-3, torch.float64: 1e-6}

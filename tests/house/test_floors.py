@@ -32,6 +32,7 @@ FLOORS = {
     "zoo.tasks": 4,
     "zoo.exchange": 4,
     "zoo.fitting": 4,
+    "zoo.questions": 4,
     "zoo.fingerprint": 4,
     "zoo.rundir": 4,
     "zoo.training": 4,

@@ -19,7 +19,7 @@ from zoo.guides.sequential import SequentialGuide
 from zoo.inference.elbo import divergences, sites
 from zoo.inference.loader import whole
 from zoo.models.dvbf import Config, Dvbf
-from zoo.tasks import Setup
+from zoo.questions import Setup
 from zoo.types import Batch
 
 LATENT, FRAMES, CHANNELS = 2, 7, 3

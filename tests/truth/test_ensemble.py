@@ -12,7 +12,7 @@ from support import movements
 import zoo
 from zoo.errors import DamagedRunError, NoJointSamplesError, NotCapableError
 from zoo.mixtures import Predictive, pooled
-from zoo.tasks import Setup
+from zoo.questions import Setup
 
 SETUP = Setup(seen=12, horizon=12, draws=20)
 

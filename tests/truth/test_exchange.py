@@ -15,7 +15,7 @@ from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
 from zoo.exchange import fingerprints
 from zoo.prediction import Prediction
-from zoo.tasks import Setup
+from zoo.questions import Setup
 
 QUICK = Setup(draws=10)
 LENGTHS = (24, 20, 24, 18, 24, 20, 22, 24)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from io import StringIO
 from typing import TYPE_CHECKING, Any, Self
 
@@ -15,7 +15,7 @@ from zoo.evaluation.scores import SCORES, Scores
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
-__all__ = ["Row", "Table", "readable"]
+__all__ = ["Refusal", "Row", "Table", "readable"]
 
 _SHOWN = tuple(
     name
@@ -36,35 +36,68 @@ class Row:
     scores: Scores
 
 
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """Why one model has no answer to one task of one data set."""
+
+    model: str
+    data: str
+    task: str
+    reason: str
+
+
 @dataclass(frozen=True)
 class Table:
     """Scores of models on tasks: a line a score, a column an answer.
 
     ``print`` and ``rich`` show it; notebooks render it; :meth:`to_markdown` and :meth:`to_json`
     keep it. JSON holds more than is shown: all levels, channels and the reliability curve.
+    ``refusals`` are the tasks that a model had no answer to, with the reason.
     """
 
     rows: tuple[Row, ...]
+    refusals: tuple[Refusal, ...] = ()
 
     @classmethod
-    def of(cls, model: str, data: str, scores: Sequence[tuple[str, Scores]]) -> Self:
-        """The table of one model's answers, given as (task, scores)."""
-        return cls(tuple(Row(model=model, data=data, task=t, scores=s) for t, s in scores))
+    def of(
+        cls,
+        model: str,
+        data: str,
+        scores: Sequence[tuple[str, Scores]],
+        refused: Mapping[str, str] | None = None,
+    ) -> Self:
+        """The table of one model's answers, given as (task, scores), and tasks refused with why."""
+        return cls(
+            tuple(Row(model=model, data=data, task=t, scores=s) for t, s in scores),
+            tuple(
+                Refusal(model=model, data=data, task=t, reason=r)
+                for t, r in (refused or {}).items()
+            ),
+        )
 
     @classmethod
     def join(cls, tables: Sequence[Table]) -> Self:
         """Several models or data sets side by side."""
-        return cls(tuple(row for table in tables for row in table.rows))
+        return cls(
+            tuple(row for table in tables for row in table.rows),
+            tuple(refusal for table in tables for refusal in table.refusals),
+        )
 
     def select(self, task: str) -> Self:
         """Only the answers to one task."""
-        return type(self)(tuple(row for row in self.rows if row.task == task))
+        return type(self)(
+            tuple(row for row in self.rows if row.task == task),
+            tuple(refusal for refusal in self.refusals if refusal.task == task),
+        )
 
     def __getitem__(self, task: str) -> Scores:
         """Scores of the first answer to ``task``."""
         for row in self.rows:
             if row.task == task:
                 return row.scores
+        for refusal in self.refusals:
+            if refusal.task == task:
+                raise KeyError(f"{refusal.model} has no answer to {task}: {refusal.reason}")
         raise KeyError(f"no task {task!r}; there are {', '.join(r.task for r in self.rows)}")
 
     @property
@@ -106,6 +139,7 @@ class Table:
             f"± is the standard error over groups (movements, trials). {counts}. "
             "Smaller is better for errors, NLL, CRPS, energy, variogram and interval scores; "
             "a band should hold its nominal share. — : the prediction cannot honestly give it."
+            + "".join(f" No answer to {r.task} by {r.model}: {r.reason}." for r in self.refusals)
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -114,7 +148,8 @@ class Table:
             "answers": [
                 {"model": r.model, "data": r.data, **r.scores.to_json(), "task": r.task}
                 for r in self.rows
-            ]
+            ],
+            "refused": [asdict(r) for r in self.refusals],
         }
 
     def to_markdown(self) -> str:
