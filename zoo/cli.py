@@ -252,23 +252,38 @@ def leaderboard(
     ] = "",
     seeds: Annotated[int, typer.Option(help="Trainings of each entry, seeds 0, 1, …")] = 1,
     folds: Annotated[
-        int | None, typer.Option(help="Folds of whole groups; default: one for each group.")
+        int, typer.Option(help="Folds of whole groups: one judged, one calibrates, others train.")
+    ] = 4,
+    data: Annotated[
+        str | None,
+        typer.Option("--data", help="Instead of a protocol: movements by name (see `zoo data`)."),
     ] = None,
+    seen: Annotated[int, typer.Option(help="With --data: frames observed.")] = 0,
+    horizon: Annotated[int, typer.Option(help="With --data: frames to forecast.")] = 0,
+    hidden: Annotated[
+        str,
+        typer.Option(help="With --data: what the channels to impute begin with, commas between."),
+    ] = "",
+    by: Annotated[str, typer.Option(help="With --data: group column of the folds.")] = "trial",
     jobs: Annotated[int, typer.Option(help="Processes, of one thread each.")] = 1,
     output: Annotated[Path, typer.Option(help="Folder for table and figure.")] = Path("results"),
     json: Json = False,
 ) -> None:
-    """Compare models on movements held out, with intervals over groups and paired tests."""
+    """Compare models on movements held out, with intervals over groups and paired tests.
+
+    Example: `zoo leaderboard --data cmu-mocap/35-run --seen 20 --horizon 40 --models mean,promp`
+    """
     from zoo.console import data_table, print_json
     from zoo.leaderboard import PROTOCOLS, run_leaderboard
+    from zoo.leaderboard.own import asked_for
 
-    if name is None:
+    if name is None and data is None:
         listing = {k: p.summary for k, p in PROTOCOLS.items()}
         print_json(listing) if json else Console().print(data_table(listing))
         return
     with _interruptible("repeat the command: what was found is kept under runs/leaderboard"):
         result = run_leaderboard(
-            name,
+            asked_for(name, data, seen, horizon, hidden, by),
             output,
             models=[m for m in models.split(",") if m],
             seeds=seeds,

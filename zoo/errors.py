@@ -2,6 +2,7 @@
 
 __all__ = [
     "DamagedRunError",
+    "FewGroupsWarning",
     "FewerInducingWarning",
     "MovementLengthError",
     "NoDensityError",
@@ -86,6 +87,10 @@ class MovementLengthError(UnanswerableError, ValueError):
 
 class TrainingError(RuntimeError):
     """Training failed for good; the message names site and step and what to try."""
+
+
+class FewGroupsWarning(UserWarning):
+    """Bands were calibrated on fewer groups than a guarantee of their level needs."""
 
 
 class NoiseDivergenceWarning(UserWarning):

@@ -14,11 +14,12 @@ from safetensors.torch import load, save
 from scipy import stats
 from sklearn.isotonic import IsotonicRegression
 
-from zoo.errors import NoDensityError, UnknownNameError
+from zoo.errors import FewGroupsWarning, NoDensityError, UnknownNameError
 from zoo.evaluation.calibration import (
     RECALIBRATIONS,
     Conformal,
     Scale,
+    promised,
     recalibrate,
     recalibration_from_state,
 )
@@ -145,6 +146,61 @@ def test_isotonic_is_the_isotonic_regression_of_the_pit() -> None:
     oracle = IsotonicRegression(out_of_bounds="clip").fit(pit, observed)
     expected = oracle.predict(stats.norm.cdf(value[:, 0]))
     np.testing.assert_allclose(mended.cdf(value)[:, 0].numpy(), expected, atol=0.012)
+
+
+@pytest.mark.parametrize("groups", [3, 9, 19])
+@pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])
+def test_what_groups_promise_is_what_ranks_give(groups: int, level: float) -> None:
+    """Simulated: n scores, the k-th smallest as band, a new score: it holds k / (n + 1) of them."""
+    generator = torch.Generator().manual_seed(groups)
+    scores = torch.rand(20_000, groups + 1, generator=generator)
+    rank = min(math.ceil((groups + 1) * level - 1e-9), groups)
+    band = scores[:, :groups].sort(1).values[:, rank - 1]
+    held = float((scores[:, groups] <= band).double().mean())
+    error = 5 * math.sqrt(0.25 / 20_000)
+    assert held == pytest.approx(rank / (groups + 1), abs=error)
+    assert promised(level, groups) <= held + error
+    assert promised(level, groups) == pytest.approx(min(level, groups / (groups + 1)))
+
+
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_few_groups_say_what_they_can_promise(count: int) -> None:
+    """Their number, n / (n + 1), and by how much the bands became wider, counted here again."""
+    raw, truth = walks(count, 700)
+    with pytest.warns(
+        FewGroupsWarning, match=f"on {count} groups.* {count / (count + 1):.0%} is"
+    ) as w:
+        found = recalibrate("conformal", raw, truth)
+    widths = [
+        float((p.interval(0.9)[1] - p.interval(0.9)[0]).mean())
+        for p in (raw.recalibrated(found), raw)
+    ]
+    assert f"{widths[0] / widths[1]:.2f} times as wide" in str(w[0].message)
+
+
+def test_nine_groups_and_other_methods_promise_in_silence() -> None:
+    """⌈10 · 0.9⌉ = 9: a 90 % band has a guarantee; stretching never had one."""
+    raw, truth = walks(9, 701)
+    recalibrate("conformal", raw, truth)
+    few, known = walks(3, 702)
+    for kind in ("scale", "isotonic"):
+        recalibrate(kind, few, known)
+
+
+def test_factors_do_not_see_the_scores_that_set_the_level() -> None:
+    """Pure noise in 40 channels of 6 groups: factors with their own scores would look too good."""
+    generator = torch.Generator().manual_seed(9)
+    inside = []
+    for _ in range(40):
+        truth = torch.randn(56, 40, generator=generator, dtype=torch.float64)
+        truth *= (0.5 * torch.randn(40, generator=generator)).exp()
+        with pytest.warns(FewGroupsWarning):
+            found = recalibrate(
+                "conformal", items(truth[:6], noise=torch.ones(1).double()), truth[:6]
+            )
+        raw = items(truth[6:], noise=torch.ones(1).double())
+        inside.append(float(covered(raw.recalibrated(found), truth[6:], 0.9).mean()))
+    assert np.mean(inside) > 0.885
 
 
 @pytest.mark.parametrize("kind", KINDS)

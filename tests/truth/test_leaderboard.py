@@ -1,4 +1,4 @@
-"""Leaderboards: paired tests by hand, bands that never see their own group, resumed tables."""
+"""Leaderboards: tests by hand, resumed tables, failures told, and boards on one's own data."""
 
 from __future__ import annotations
 
@@ -8,35 +8,32 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
-from support import movements
+from support import movements, pairs
 
 from zoo.datasets.records import Sequences
 from zoo.errors import UnknownNameError
-from zoo.leaderboard import board, cells, judge, protocols
+from zoo.experiments.result import Result
+from zoo.leaderboard import board, cells, own, own_protocol, statistics
 from zoo.leaderboard.cells import Cell
-from zoo.leaderboard.protocols import Protocol
-from zoo.prediction import Prediction, Predictive
+from zoo.leaderboard.protocol import Fold, Protocol
 
 TINY = Protocol(
+    name="tiny",
     summary="tiny",
     load=movements,
     source="simulated",
     need="forecast",
     models=("mean", "last-value", "nearest-neighbour"),
     seen=12,
+    horizon=12,
 )
-
-
-@pytest.fixture
-def tiny(monkeypatch: pytest.MonkeyPatch) -> Protocol:
-    """A protocol of eight small movements, known by name."""
-    monkeypatch.setitem(protocols.PROTOCOLS, "tiny", TINY)
-    return TINY
+NOTHING = Fold(train=(2, 3, 4), calibration=(), judged=(0,))
 
 
 def test_intervals_and_adjusted_tests_are_those_of_the_textbook() -> None:
@@ -44,7 +41,7 @@ def test_intervals_and_adjusted_tests_are_those_of_the_textbook() -> None:
     rng = np.random.default_rng(0)
     ours, theirs = rng.normal(size=8), rng.normal(0.7, size=8)
     low, high = stats.t.interval(0.95, 7, ours.mean(), stats.sem(ours))
-    found = judge.interval(ours)
+    found = statistics.interval(ours)
     assert found.mean - found.half == pytest.approx(low)
     assert found.mean + found.half == pytest.approx(high)
     ranks = stats.rankdata(np.abs(ours - theirs))
@@ -53,62 +50,28 @@ def test_intervals_and_adjusted_tests_are_those_of_the_textbook() -> None:
     observed = ranks[ours > theirs].sum()
     extreme = min(observed, ranks.sum() - observed)
     p = np.mean((sums <= extreme) | (sums >= ranks.sum() - extreme))
-    assert judge.paired(ours, theirs) == pytest.approx(p)
-    assert judge.paired(ours, ours) == 1.0
-    assert judge.holm([0.04, 0.01, 0.5]) == pytest.approx([0.08, 0.03, 0.5])
+    assert statistics.paired(ours, theirs) == pytest.approx(p)
+    assert statistics.paired(ours, ours) == 1.0
+    assert statistics.holm([0.04, 0.01, 0.5]) == pytest.approx([0.08, 0.03, 0.5])
 
 
-def test_a_band_is_never_calibrated_on_the_group_it_is_judged_by() -> None:
-    """One group's errors blown up a thousandfold leave its own calibrated width untouched."""
-    truth = torch.randn(10, 6, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    prediction = Prediction(
-        predictive=Predictive(location=torch.zeros(1, 10, 6, 2).double(), noise=torch.ones(2)),
-        axes=("sequence", "time", "channel"),
-        names=("a", "b"),
-        units=("rad", "rad"),
-        task="forecast",
-    )
-    wild = truth.clone()
-    wild[3] *= 1000
-    rows, groups = list(range(10)), list("abcdefghij")
-    widths = [
-        judge.judged([(rows, prediction)], t, torch.ones_like(t).bool(), groups)[
-            "calibrated_width_90"
-        ]
-        for t in (truth, wild)
-    ]
-    assert widths[0][3] == pytest.approx(widths[1][3])
-    assert (widths[1][[0, 1, 2, 4, 5]] > widths[0][[0, 1, 2, 4, 5]]).any()
-
-
-def test_no_model_sees_the_movements_it_is_asked_about(tiny: Protocol) -> None:
-    """Folds part the rows; groups stay together; impossible numbers of folds are named."""
-    data = movements()
-    for count in (None, 2, 3, 8):
-        folds = tiny.folds(data, count)
-        assert sorted(row for rows in folds for row in rows) == list(range(8))
-    subjects = replace(tiny, by="subject").folds(data, None)
-    assert subjects == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    with pytest.raises(ValueError, match="between 2 and 8"):
-        tiny.folds(data, 9)
-
-
-def test_a_repeated_command_takes_what_was_found(tiny: Protocol, tmp_path: Path) -> None:
+def test_a_repeated_command_takes_what_was_found(tmp_path: Path) -> None:
     """Equal tables; nothing is computed twice; another seed or a damaged cell is."""
     told: list[str] = []
 
-    def table(**options: object) -> Sequences | object:
+    def table(**options: Any) -> Result:
         where = {"root": tmp_path / "cells", "note": told.append}
-        return board.run_leaderboard("tiny", tmp_path / "out", **where, **options)
+        return board.run_leaderboard(TINY, tmp_path / "out", **where, **options)
 
     first = table()
     stamps = {f: f.stat().st_mtime_ns for f in (tmp_path / "cells").rglob("cell.json")}
-    assert len(stamps) == 3 * 8 == len(told)
+    assert len(stamps) == 3 * 4 == len(told)
     again = table()
     assert {f: f.stat().st_mtime_ns for f in stamps} == stamps
     assert first.rows == again.rows
     stored = json.loads((tmp_path / "out" / "leaderboard_tiny.json").read_text())
     assert stored["details"]["scores"]["mean"]["mse"]
+    assert stored["command"] == "zoo leaderboard tiny --folds 4"
     damaged = next(iter(stamps))
     damaged.write_text("{}")
     assert [row[:-1] for row in table().rows] == [row[:-1] for row in first.rows]
@@ -117,34 +80,36 @@ def test_a_repeated_command_takes_what_was_found(tiny: Protocol, tmp_path: Path)
     assert len(list((tmp_path / "cells").rglob("cell.json"))) == 2 * len(stamps)
 
 
-def test_cells_are_kept_by_data_and_code(
-    tiny: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cells_are_kept_by_data_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Same name, other values: all anew. Other code of the question: answers alone are anew."""
-    cell = Cell(protocol="tiny", model="mean", settings=((),), seed=0, fold=0, rows=(0,))
-    first = cells.compute(cell, tmp_path, tiny)
-    again = cells.compute(cell, tmp_path, tiny)
+    asked = cell("mean", NOTHING)
+    first, again = (cells.compute(asked, tmp_path, TINY) for _ in range(2))
     assert (first.reused, again.reused) == ("", "answer") and again.seconds == first.seconds
     louder = replace(movements(), values=2 * movements().values)
-    other = cells.compute(cell, tmp_path, replace(tiny, load=lambda: louder))
+    other = cells.compute(asked, tmp_path, replace(TINY, load=lambda: louder))
+    assert first.prediction is not None and other.prediction is not None
     assert other.reused == "" and not torch.equal(other.prediction.mean, first.prediction.mean)
     monkeypatch.setattr(cells, "code", lambda roots: {"code of zoo.tasks": "#other"})
-    assert cells.compute(cell, tmp_path, tiny).reused == "training"
+    assert cells.compute(asked, tmp_path, TINY).reused == "training"
     monkeypatch.setattr("zoo.fingerprint.hashes", lambda roots: {"zoo.models.mean": "other"})
-    assert cells.compute(cell, tmp_path, tiny).reused == ""
+    assert cells.compute(asked, tmp_path, TINY).reused == ""
 
 
 def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
-    """Cells of a protocol that every process knows, computed apart."""
-    some = [
-        Cell(protocol="arm-goals", model="promp", settings=((),), seed=0, fold=k, rows=(k,))
-        for k in range(2)
-    ]
-    apart = cells.compute_all(some, tmp_path / "two", 2, lambda found: None)
-    alone = cells.compute_all(some, tmp_path / "one", 1, lambda found: None)
+    """Cells of a protocol that was made in this process, computed apart."""
+    asked = own_protocol(movements(), seen=12, horizon=12)
+    some = [cell("promp", replace(NOTHING, judged=(k,))) for k in range(2)]
+    apart = cells.compute_all(some, tmp_path / "two", asked, 2, lambda found: None)
+    alone = cells.compute_all(some, tmp_path / "one", asked, 1, lambda found: None)
     for two, one in zip(apart, alone, strict=True):
         assert two.prediction is not None and one.prediction is not None
         assert torch.equal(two.prediction.mean, one.prediction.mean)
+
+
+def cell(model: str, fold: Fold) -> Cell:
+    """A cell of an entry, or of several together, with their default settings."""
+    settings = tuple(() for _ in model.split("+"))
+    return Cell(protocol="tiny", model=model, settings=settings, seed=0, number=0, fold=fold)
 
 
 ORPHANS = """
@@ -183,32 +148,98 @@ def alive(process: int) -> bool:
     return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def test_an_entry_that_fails_is_a_line_and_not_the_end(
-    tiny: Protocol, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_entry_that_fails_is_a_line_and_not_the_end(tmp_path: Path) -> None:
     """Its error is told in the findings; the others are judged."""
-    broken = replace(tiny, settings={"ar": {"order": 40}})
-    monkeypatch.setitem(protocols.PROTOCOLS, "tiny", broken)
-    found = board.run_leaderboard("tiny", tmp_path, models=["mean", "ar"], root=tmp_path / "cells")
+    broken = replace(TINY, settings={"ar": {"order": 40}})
+    found = board.run_leaderboard(broken, tmp_path, models=["mean", "ar"], root=tmp_path / "cells")
     assert [row[0] for row in found.rows] == ["mean"]
     assert any("ar failed" in line for line in found.findings)
 
 
-def test_an_ensemble_of_entries_is_one_model(tiny: Protocol, tmp_path: Path) -> None:
+def test_a_model_that_cannot_be_judged_is_a_line_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What scoring refuses, such as a standard deviation of 0, is that model's error."""
+
+    def refused(*_: object) -> None:
+        raise ValueError("12 known entries are predicted with a spread of 0")
+
+    monkeypatch.setattr(board, "judged", refused)
+    with pytest.raises(ValueError, match="no model could answer tiny: ValueError: 12 known"):
+        board.run_leaderboard(TINY, tmp_path, models=["mean"], root=tmp_path / "cells")
+
+
+def test_errors_of_zero_are_drawn(tmp_path: Path) -> None:
+    """Movements that stand still, forecast exactly."""
+    still = Sequences.from_arrays(np.zeros((6, 24, 2)), rate=30.0, name="still")
+    asked = own_protocol(still, seen=12, horizon=12)
+    where: dict[str, Any] = {"models": ["mean"], "folds": 3, "root": tmp_path / "cells"}
+    found = board.run_leaderboard(asked, tmp_path, **where)
+    assert found.rows[0][1] == "0 ± 0"
+    assert (tmp_path / "leaderboard_still-12-12.png").exists()
+
+
+def test_few_folds_and_a_single_model_are_a_board(tmp_path: Path) -> None:
+    """The least of everything: one model, three folds; two are refused with the reason."""
+    some: dict[str, Any] = {"models": ["nearest-neighbour"], "root": tmp_path / "cells"}
+    found = board.run_leaderboard(TINY, tmp_path, folds=3, **some)
+    assert [row[0] for row in found.rows] == ["nearest-neighbour"]
+    with pytest.raises(ValueError, match=r"folds must be between 3 .* and 8, .*; got 2"):
+        board.run_leaderboard(TINY, tmp_path, folds=2, **some)
+
+
+def test_one_calibrating_group_corrects_nothing_and_says_so(tmp_path: Path) -> None:
+    """Eight folds of one movement each: raw bands only."""
+    where: dict[str, Any] = {"models": ["mean"], "root": tmp_path / "cells"}
+    found = board.run_leaderboard(TINY, tmp_path, folds=8, **where)
+    assert "No band was calibrated" in " ".join(found.findings)
+    assert found.sections[0].rows[0][2] == "" != found.sections[0].rows[0][1]
+
+
+def test_an_ensemble_of_entries_is_one_model(tmp_path: Path) -> None:
     """Its predictions are the average of the members'."""
     names = ["mean", "last-value", "mean+last-value"]
-    found = {}
-    for name in names:
-        parts = tuple(() for _ in name.split("+"))
-        cell = Cell(protocol="tiny", model=name, settings=parts, seed=0, fold=0, rows=(0, 1))
-        found[name] = cells.compute(cell, tmp_path).prediction
-    means = [p.mean for p in found.values() if p is not None]
+    found = [cells.compute(cell(name, NOTHING), tmp_path, TINY).prediction for name in names]
+    means = [p.mean for p in found if p is not None]
     torch.testing.assert_close(means[2], (means[0] + means[1]) / 2)
+
+
+def test_own_movements_make_a_board(tmp_path: Path) -> None:
+    """Forecast or imputed, in their own groups; the table says that nothing hidden is used."""
+    where: dict[str, Any] = {"models": ["mean", "kernel-ridge"], "root": tmp_path / "cells"}
+    forecast = own_protocol(movements(), seen=10, horizon=8)
+    imputed = own_protocol(movements(), hidden=["joint_2", "joint_5"])
+    for asked in (forecast, imputed):
+        found = board.run_leaderboard(asked, tmp_path, **where)
+        assert len(found.rows) == 2
+        assert "nothing of what is hidden is used" in found.title
+        assert found.source == "own"
+    assert found.details["channels"] == ["joint_2", "joint_5"]
+    assert (tmp_path / "leaderboard_tiny-without-joint_2-joint_5.json").exists()
+
+
+def test_what_own_movements_cannot_be_asked_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Too many frames, unknown or all channels, no such group, both questions at once."""
+    data = movements()
+    with pytest.raises(ValueError, match=r"24 together, .*'tiny'; got 20 and 8"):
+        own_protocol(data, seen=20, horizon=8)
+    for hidden in (["knee"], ["joint"]):
+        with pytest.raises(ValueError, match=f"some of the 7 channels .*; got {hidden[0]}"):
+            own_protocol(data, hidden=hidden)
+    with pytest.raises(ValueError, match="no group column 'day'; there are trial, subject"):
+        own_protocol(data, seen=10, horizon=8, by="day")
+    with pytest.raises(ValueError, match="got both"):
+        own_protocol(data, seen=10, horizon=8, hidden=["joint_1"])
+    with pytest.raises(ValueError, match="need --data"):
+        own.asked_for("arm-goals", None, 10, 0, "", "trial")
+    monkeypatch.setattr(own, "load_data", lambda name: pairs())
+    with pytest.raises(TypeError, match="forces holds Pairs"):
+        own.asked_for(None, "forces", 10, 5, "", "trial")
 
 
 def test_unknown_protocols_and_models_are_named(tmp_path: Path) -> None:
     """What there is, in the error."""
-    with pytest.raises(UnknownNameError, match="walk-setup-2"):
+    with pytest.raises(UnknownNameError, match="walk-setup-2-published"):
         board.run_leaderboard("walk", tmp_path)
     with pytest.raises(UnknownNameError, match="that can forecast"):
         board.run_leaderboard("arm-goals", tmp_path, models=["pca"])

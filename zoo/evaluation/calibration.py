@@ -7,6 +7,8 @@ group weighs the same, and scores that set a level come from groups left out of 
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import NormalDist
@@ -15,7 +17,7 @@ from typing import Any, ClassVar, Protocol, Self
 import torch
 from torch import Tensor
 
-from zoo.errors import UnknownNameError
+from zoo.errors import FewGroupsWarning, UnknownNameError
 from zoo.evaluation.answers import Answer, Groups
 from zoo.evaluation.curve import Curve
 from zoo.evaluation.factors import By, Factors, crossed, standardised
@@ -34,9 +36,12 @@ __all__ = [
     "Conformal",
     "Isotonic",
     "Scale",
+    "promised",
     "recalibrate",
     "recalibration_from_state",
 ]
+
+_WARNED = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,7 +257,9 @@ def recalibrate(
     """A correction of ``prediction``'s spread, to be used on predictions of the same kind.
 
     ``kind`` is ``conformal``, ``isotonic`` or ``scale``; ``by`` says which factors are fitted
-    beside the common one. Groups are those of :func:`~zoo.evaluation.answers.clusters`.
+    beside the common one. Groups are those of :func:`~zoo.evaluation.answers.clusters`. Of too few
+    for a conformal 90 % band with a guarantee (see :func:`promised`) a
+    :class:`~zoo.errors.FewGroupsWarning` says what they can promise and what the bands became.
 
     >>> import torch
     >>> raw = Prediction(
@@ -266,7 +273,42 @@ def recalibrate(
     answer = Answer.of(prediction.raw, truth, mask, groups)
     if answer.groups < 2:
         raise ValueError("recalibration needs at least 2 groups (movements or items); got 1")
-    return _kind(kind).fit(answer, by)
+    found = _kind(kind).fit(answer, by)
+    if isinstance(found, Conformal) and promised(_WARNED, answer.groups) < _WARNED:
+        warnings.warn(_few(found, answer), FewGroupsWarning, stacklevel=2)
+    return found
+
+
+def promised(level: float, groups: int) -> float:
+    """Coverage that conformal bands of ``groups`` exchangeable groups can promise a new one.
+
+    With n groups it takes the ⌈(n + 1) level⌉-th smallest of n scores; where that is beyond n, no
+    finite band has the level, and the widest, up to the largest score, has n / (n + 1). Vovk,
+    Gammerman & Shafer, *Algorithmic learning in a random world*, 2005; for groups Lee, Barber &
+    Willett, *Distribution-free inference with hierarchical data*, 2023.
+
+    >>> promised(0.9, 9), promised(0.9, 3)
+    (0.9, 0.75)
+    """
+    return level if math.ceil((groups + 1) * level - 1e-9) <= groups else groups / (groups + 1)
+
+
+def _few(found: Conformal, answer: Answer) -> str:
+    """What few groups can promise at 90 %, what the bands rest on instead, and their width."""
+    raw, groups = answer.prediction, answer.groups
+    widths = [
+        (high - low)[answer.mask].double().mean()
+        for low, high in (p.interval(_WARNED) for p in (raw.recalibrated(found), raw))
+    ]
+    rank = math.ceil((groups + 1) * _WARNED - 1e-9)
+    return (
+        f"conformal bands fitted on {groups} groups: a {_WARNED:.0%} band with a guarantee for a "
+        f"new group takes the {rank}th smallest of the groups' scores, and there are {groups}; "
+        f"{promised(_WARNED, groups):.0%} is the most that they can promise. The band given "
+        f"counts their entries as {found.worth:.1f} independent ones (good for "
+        f"{found.reach:.0%}, continued like a Gaussian's beyond) and is on average "
+        f"{widths[0] / widths[1]:.2f} times as wide as the raw one; nothing is promised for it"
+    )
 
 
 def recalibration_from_state(meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Recalibration:

@@ -99,12 +99,13 @@ def score(
     by: str | None = None,
     draws: int = 200,
     seed: int = 0,
+    joint: bool = True,
 ) -> Scores:
     """Every score that ``prediction`` can honestly be given; unknown truth is left out.
 
     Standard errors are jackknifed over groups (movements, trials): see
     :func:`~zoo.evaluation.answers.clusters`. ``draws`` joint samples give the energy and variogram
-    scores. A deterministic prediction gets error scores only.
+    scores, which ``joint=False`` leaves out. A deterministic prediction gets error scores only.
     """
     if draws < 2:
         raise ValueError(f"draws must be at least 2; got {draws}")
@@ -116,7 +117,7 @@ def score(
         reliability = Reliability.of(answer)
         entrywise |= _spread_scores(answer)
         values |= {k: _mean(v, answer) for k, v in entrywise.items()}
-        values |= _joint_scores(answer, draws, seed)
+        values |= _joint_scores(answer, draws, seed) if joint else {}
         values["calibration_error"] = _percent(reliability.calibration_error)
     return Scores(
         task=prediction.task,

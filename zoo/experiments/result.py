@@ -23,9 +23,9 @@ from zoo.experiments.kept import timed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "Experiment", "Result", "run_experiment", "write_result"]
+__all__ = ["EXPERIMENTS", "Experiment", "Result", "Section", "run_experiment", "write_result"]
 
-Source = Literal["thesis", "public", "simulated"]
+Source = Literal["thesis", "public", "simulated", "own"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +34,15 @@ class Experiment:
 
     summary: str
     module: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A further table of a result under a title of its own."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +60,7 @@ class Result:
     rows: tuple[tuple[Any, ...], ...]
     findings: tuple[str, ...]
     seed: int
+    sections: tuple[Section, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
     cards: Sequence[Mapping[str, Any]] = ()
     figure: Figure | None = None
@@ -62,10 +72,10 @@ class Result:
     def markdown(self) -> str:
         """The table and the findings."""
         head = f"# {self.identifier}: {self.title}\n\nData: {self.source}.\n"
-        lines = ["| " + " | ".join(self.columns) + " |", "|" + "---|" * len(self.columns)]
-        lines += ["| " + " | ".join(_cell(c) for c in row) + " |" for row in self.rows]
+        parts = [_table(self.columns, self.rows)]
+        parts += [f"## {s.title}\n\n{_table(s.columns, s.rows)}" for s in self.sections]
         findings = "\n".join(f"- {f}" for f in self.findings)
-        return f"{head}\n" + "\n".join(lines) + f"\n\n{findings}\n"
+        return f"{head}\n" + "\n\n".join(parts) + f"\n\n{findings}\n"
 
     def to_json(self) -> dict[str, Any]:
         """Everything but the figure as plain data, with versions and duration."""
@@ -79,6 +89,10 @@ class Result:
             **self._training(),
             "columns": list(self.columns),
             "rows": [list(r) for r in self.rows],
+            "sections": [
+                {"title": s.title, "columns": list(s.columns), "rows": [list(r) for r in s.rows]}
+                for s in self.sections
+            ],
             "findings": list(self.findings),
             "details": dict(self.details),
             "cards": [
@@ -171,10 +185,26 @@ def _write(result: Result, output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     stem = output / result.identifier
     stem.with_name(f"{result.identifier}.md").write_text(result.markdown(), encoding="utf-8")
-    text = json.dumps(result.to_json(), indent=1, allow_nan=False)
+    text = _indented(result.to_json())
     stem.with_name(f"{result.identifier}.json").write_text(text + "\n", encoding="utf-8")
     if result.figure is not None:
         result.figure.savefig(stem.with_name(f"{result.identifier}.png"), dpi=150)
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    return "\n".join([*lines, *("| " + " | ".join(_cell(c) for c in r) + " |" for r in rows)])
+
+
+def _indented(value: Any, indent: str = "") -> str:
+    """JSON, a line an item; lists of plain values take one line."""
+    deeper = indent + " "
+    if isinstance(value, dict) and value:
+        items = (f"{deeper}{json.dumps(str(k))}: {_indented(v, deeper)}" for k, v in value.items())
+        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
+    if isinstance(value, list) and any(isinstance(v, (dict, list)) for v in value):
+        return "[\n" + ",\n".join(deeper + _indented(v, deeper) for v in value) + f"\n{indent}]"
+    return json.dumps(value, allow_nan=False)
 
 
 def _cell(value: Any) -> str:

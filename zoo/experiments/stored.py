@@ -30,20 +30,26 @@ class Stored:
         findings = "".join(f"<li>{html.escape(f)}</li>" for f in self.payload["findings"])
         return (
             f"<h4>{html.escape(self.payload['id'])}: {html.escape(self.payload['title'])}</h4>"
-            f'<div style="overflow-x:auto">{self._table()}</div><ul>{findings}</ul>'
+            f"{self._table(self.payload)}{self._sections()}<ul>{findings}</ul>"
             f"<p>Reproduce: <code>{html.escape(self.payload['command'])}</code> "
             f"(data: {html.escape(self.payload['source'])}).</p>{self._image()}"
         )
 
-    def _table(self) -> str:
-        head = "".join(_cell("th", c, first=not i) for i, c in enumerate(self.payload["columns"]))
+    def _sections(self) -> str:
+        return "".join(
+            f"<h5>{html.escape(section['title'])}</h5>{self._table(section)}"
+            for section in self.payload.get("sections", ())
+        )
+
+    def _table(self, part: Mapping[str, Any]) -> str:
+        head = "".join(_cell("th", c, first=not i) for i, c in enumerate(part["columns"]))
         rows = (
-            "".join(_cell("td", c, first=not i) for i, c in enumerate(row))
-            for row in self.payload["rows"]
+            "".join(_cell("td", c, first=not i) for i, c in enumerate(row)) for row in part["rows"]
         )
         body = "".join(f"<tr>{row}</tr>" for row in rows)
         return (
-            f'<table style="font-size:12px;margin:0"><thead><tr>{head}</tr></thead>{body}</table>'
+            '<div style="overflow-x:auto"><table style="font-size:12px;margin:0">'
+            f"<thead><tr>{head}</tr></thead>{body}</table></div>"
         )
 
     def _image(self) -> str:

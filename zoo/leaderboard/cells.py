@@ -1,4 +1,4 @@
-"""One cell of a leaderboard: models trained without a fold, and their prediction of that fold."""
+"""One cell of a leaderboard: models trained on a fold's training part, and their predictions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, Literal
@@ -23,21 +23,22 @@ from zoo.ensemble import Ensemble
 from zoo.errors import DamagedRunError
 from zoo.fingerprint import code, fingerprint, key
 from zoo.fitting import fit
-from zoo.leaderboard.protocols import PROTOCOLS, Protocol
+from zoo.leaderboard.protocol import Fold, Protocol
 from zoo.prediction import Prediction, Predictive
 from zoo.run import create
 
-__all__ = ["Cell", "Found", "compute", "compute_all"]
+__all__ = ["FAILURES", "Cell", "Found", "compute", "compute_all"]
 
-VERSION = 2
+VERSION = 3
 # a multiple of the 16 components of exact mixtures: an equal ensemble of both then has 48
 DRAWS = 48
+FAILURES = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 _PARTS = ("location", "noise", "epistemic", "draws")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Which model, trained with which settings and seed without which rows.
+    """Which model, trained with which settings and seed on which rows, answers for which others.
 
     ``promp+kernel-ridge`` is an ensemble of two entries; ``settings`` are those of each.
     """
@@ -46,14 +47,19 @@ class Cell:
     model: str
     settings: tuple[tuple[tuple[str, Any], ...], ...]
     seed: int
-    fold: int
-    rows: tuple[int, ...]
+    number: int
+    fold: Fold
 
     @property
     def members(self) -> tuple[tuple[str, dict[str, Any]], ...]:
         """Entries and their settings."""
         pairs = zip(self.model.split("+"), self.settings, strict=True)
         return tuple((name, dict(settings)) for name, settings in pairs)
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Those that are predicted: the calibration part's, then the judged ones."""
+        return self.fold.calibration + self.fold.judged
 
     def folder(self, root: Path, made_of: object) -> Path:
         """Where its answer is kept, by all that it depends on."""
@@ -75,24 +81,22 @@ class Found:
     reused: Literal["", "answer", "training"] = ""
 
 
-def compute(cell: Cell, root: Path, protocol: Protocol | None = None) -> Found:
+def compute(cell: Cell, root: Path, asked: Protocol) -> Found:
     """The answer, from its folder if it was found before; a training goes on where it stopped."""
-    asked = PROTOCOLS[cell.protocol] if protocol is None else protocol
     try:
-        data = _loaded(asked.load, os.environ.get("MOVEZOO_DATA"))
-        inside = set(cell.rows)
-        train = data[[i for i in range(len(data)) if i not in inside]]
+        data = asked.prepared(_loaded(asked.load, os.environ.get("MOVEZOO_DATA")))
+        train = data[list(cell.fold.train)]
         made = [create(name, train, seed=cell.seed, **options) for name, options in cell.members]
         folder = cell.folder(
             root, _made_of(cell, asked, data, [fingerprint(m, train) for m in made])
         )
         return _kept(cell, folder) or _answered(cell, asked, data, train, made, root, folder)
-    except (RuntimeError, TypeError, ValueError) as stop:
+    except FAILURES as stop:
         error = f"{type(stop).__name__}: {stop}"
         return Found(cell=cell, prediction=None, error=error, seconds=0.0)
 
 
-@cache
+@lru_cache(maxsize=1)
 def _loaded(load: Callable[[], Sequences], folder: str | None) -> Sequences:
     """The data, once in a process; ``folder`` is where the loader looks."""
     return load()
@@ -108,26 +112,30 @@ def _made_of(
 
 
 def compute_all(
-    cells: Sequence[Cell], root: Path, jobs: int, note: Callable[[Found], None]
+    cells: Sequence[Cell],
+    root: Path,
+    asked: Protocol,
+    jobs: int,
+    note: Callable[[Found], None],
 ) -> list[Found]:
     """All answers, in processes of one thread each; ensembles last, of what was trained by then."""
     done: dict[Cell, Found] = {}
     alone = [cell for cell in cells if len(cell.members) == 1]
     together = [cell for cell in cells if len(cell.members) > 1]
     for stage in (alone, together):
-        for answer in _computed(stage, root, jobs):
+        for answer in _computed(stage, root, asked, jobs):
             done[answer.cell] = answer
             note(answer)
     return [done[cell] for cell in cells]
 
 
-def _computed(cells: Sequence[Cell], root: Path, jobs: int) -> Iterator[Found]:
+def _computed(cells: Sequence[Cell], root: Path, asked: Protocol, jobs: int) -> Iterator[Found]:
     """Answers as they are found."""
     if jobs == 1:
-        yield from (compute(cell, root) for cell in cells)
+        yield from (compute(cell, root, asked) for cell in cells)
         return
     with ProcessPoolExecutor(jobs, get_context("spawn"), _begin) as pool:
-        futures = [pool.submit(compute, cell, root) for cell in cells]
+        futures = [pool.submit(compute, cell, root, asked) for cell in cells]
         try:
             for future in as_completed(futures):
                 yield future.result()

@@ -1,143 +1,176 @@
-"""Scores of every movement held out, its bands calibrated on all the others, and paired tests."""
+"""Scores of movements that neither a model nor the correction of its bands was fitted on."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 from numpy.typing import NDArray
-from scipy import stats
 from torch import Tensor
 
+from zoo.errors import FewGroupsWarning
 from zoo.evaluation.calibration import recalibrate
 from zoo.evaluation.scores import score
-from zoo.prediction import Prediction, Predictive
+from zoo.leaderboard.protocol import Fold
+from zoo.leaderboard.statistics import Column
+from zoo.prediction import Prediction
 
-__all__ = ["SHOWN", "Interval", "holm", "interval", "judged", "paired"]
+__all__ = ["BLOCKS", "LEVEL", "SHOWN", "Judged", "blocks", "judged"]
 
-SHOWN = ("mse", "rmse", "crps", "energy", "nll", "coverage_50", "coverage_90", "width_90")
-Column = NDArray[np.float64]
+SHOWN = (
+    "mse",
+    "rmse",
+    "crps",
+    "energy",
+    "nll",
+    "coverage_50",
+    "coverage_90",
+    "width_50",
+    "width_90",
+)
+LEVEL = 0.9
+BLOCKS = 6
+Cube = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Interval:
-    """A mean over groups and the half width of its 95 % confidence interval (Student's t)."""
+@dataclass(frozen=True, kw_only=True)
+class Judged:
+    """One value a group, in order, of every score; coverage of the 90 % bands in detail.
 
-    mean: float
-    half: float
-
-
-def interval(values: Column) -> Interval:
-    """Mean and confidence interval of values of independent groups.
-
-    >>> found = interval(np.array([1.0, 2.0, 3.0]))
-    >>> round(found.mean, 2), round(found.half, 2)
-    (2.0, 2.48)
+    ``coverage`` has ``raw`` and ``calibrated`` shares in per cent by group × channel × block of
+    frames, NaN where nothing was asked.
     """
-    if len(values) < 2:
-        return Interval(float(values.mean()), float("nan"))
-    error = values.std(ddof=1) / np.sqrt(len(values))
-    return Interval(float(values.mean()), float(stats.t.ppf(0.975, len(values) - 1) * error))
 
+    scores: Mapping[str, Column]
+    coverage: Mapping[str, Cube]
 
-def paired(ours: Column, theirs: Column) -> float:
-    """p of Wilcoxon's signed-rank test that paired groups differ by nothing, two-sided."""
-    if np.array_equal(ours, theirs):
-        return 1.0
-    return float(stats.wilcoxon(ours, theirs).pvalue)
+    @classmethod
+    def mean(cls, seeds: Sequence[Judged]) -> Self:
+        """Seeds averaged within each group."""
 
+        def averaged(parts: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, Cube]:
+            shared = [k for k in parts[0] if all(k in part for part in parts)]
+            return {k: np.mean([part[k] for part in parts], axis=0) for k in shared}
 
-def holm(p: Sequence[float]) -> list[float]:
-    """Holm's adjustment of the p values of several tests.
-
-    >>> [round(v, 3) for v in holm([0.01, 0.04, 0.03])]
-    [0.03, 0.06, 0.06]
-    """
-    order = np.argsort(p)
-    raised = np.maximum.accumulate([(len(p) - k) * p[i] for k, i in enumerate(order)])
-    adjusted = np.empty(len(p))
-    adjusted[order] = np.minimum(raised, 1.0)
-    return [float(v) for v in adjusted]
+        return cls(
+            scores=averaged([s.scores for s in seeds]),
+            coverage=averaged([s.coverage for s in seeds]),
+        )
 
 
 def judged(
-    predictions: Sequence[tuple[Sequence[int], Prediction]],
+    folds: Sequence[tuple[Fold, Prediction]],
     truth: Tensor,
     mask: Tensor,
     groups: Sequence[object],
-) -> Mapping[str, Column]:
-    """Scores by name, of every group in order, raw and with bands calibrated on the others.
+) -> Judged:
+    """Scores of every group, raw and with bands corrected on the fold's calibration part.
 
-    ``predictions`` are of the rows of each fold. No prediction is of a movement that its model
-    saw, and no band is calibrated on the group that it is judged by.
+    Each prediction is of the rows of its fold's calibration part, then of those judged. A part of
+    a single group corrects nothing: calibrated scores are then absent.
     """
-    whole = _joined(predictions)
-    order = list(dict.fromkeys(groups))
-    columns: dict[str, list[float]] = {}
-    for group in order:
-        here = torch.tensor([g == group for g in groups])
-        found = _scores(whole, truth, mask, [str(g) for g in groups], here)
-        for name, value in found.items():
-            columns.setdefault(name, []).append(value)
-    return {k: np.array(v) for k, v in columns.items() if len(v) == len(order)}
+    found: dict[object, list[_Entry]] = {}
+    for fold, prediction in folds:
+        for kind, answer in _answers(fold, prediction, truth, mask, groups).items():
+            for group, inside in _members(fold.judged, groups).items():
+                rows = torch.tensor(fold.judged)[inside]
+                entry = _entry(kind, _rows(answer, inside), truth[rows], mask[rows])
+                found.setdefault(group, []).append(entry)
+    order = [found[g] for g in dict.fromkeys(groups)]
+    return Judged(
+        scores=_columns([{k: v for e in each for k, v in e.scores.items()} for each in order]),
+        coverage=_columns([{k: v for e in each for k, v in e.coverage.items()} for each in order]),
+    )
 
 
-def _scores(
-    whole: Prediction, truth: Tensor, mask: Tensor, groups: Sequence[str], here: Tensor
-) -> dict[str, float]:
-    own, others = _rows(whole, here), _rows(whole, ~here)
-    found = score(own, truth[here], mask[here])
-    values = {k: e.value for k in SHOWN if (e := found[k]) is not None}
-    if not own.has_spread:
-        return values
-    rest = {"group": [g for g, inside in zip(groups, here.tolist(), strict=True) if not inside]}
-    correction = recalibrate("conformal", others, truth[~here], mask[~here], rest)
-    mended = score(own.recalibrated(correction), truth[here], mask[here])
-    return values | {f"calibrated_{k}": e.value for k in SHOWN if (e := mended[k]) is not None}
+def blocks(frames: int) -> list[tuple[int, int]]:
+    """First frame and end of each of six blocks of equal length, of fewer where frames are few.
+
+    >>> blocks(20)
+    [(0, 3), (3, 7), (7, 10), (10, 13), (13, 17), (17, 20)]
+    """
+    count = min(BLOCKS, frames)
+    edges = [round(i * frames / count) for i in range(count + 1)]
+    return list(pairwise(edges))
 
 
-def _rows(prediction: Prediction, rows: Tensor) -> Prediction:
+def _answers(
+    fold: Fold, prediction: Prediction, truth: Tensor, mask: Tensor, groups: Sequence[object]
+) -> dict[str, Prediction]:
+    """The judged rows' prediction as it is and, by the prefix ``calibrated_``, corrected."""
+    place = torch.arange(len(fold.calibration) + len(fold.judged))
+    known = _rows(prediction, place < len(fold.calibration))
+    asked = _rows(prediction, place >= len(fold.calibration))
+    names = [str(groups[row]) for row in fold.calibration]
+    if not asked.has_spread or len(set(names)) < 2:
+        return {"": asked}
+    rows, frames = torch.tensor(fold.calibration), known.shape[1]
+    values, asked_for = truth[rows, :frames], mask[rows, :frames]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FewGroupsWarning)
+        correction = recalibrate("conformal", known, values, asked_for, {"group": names})
+    return {"": asked, "calibrated_": asked.recalibrated(correction)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Entry:
+    scores: Mapping[str, float]
+    coverage: Mapping[str, Cube]
+
+
+def _entry(kind: str, prediction: Prediction, truth: Tensor, mask: Tensor) -> _Entry:
+    """One group's scores and coverage, raw or with corrected bands."""
+    frames = prediction.shape[1]
+    truth, mask = truth[:, :frames], mask[:, :frames]
+    scores = score(prediction, truth, mask, joint=not kind)
+    return _Entry(
+        scores={kind + k: e.value for k in SHOWN if (e := scores[k]) is not None},
+        coverage={}
+        if not prediction.has_spread
+        else {"calibrated" if kind else "raw": _coverage(prediction, truth, mask)},
+    )
+
+
+def _members(rows: Sequence[int], groups: Sequence[object]) -> dict[object, Bool[Tensor, " row"]]:
+    """Which of the rows belong to each group."""
+    names = [groups[row] for row in rows]
+    return {g: torch.tensor([n == g for n in names]) for g in dict.fromkeys(names)}
+
+
+def _coverage(prediction: Prediction, truth: Tensor, mask: Tensor) -> Cube:
+    """Share of the known truth inside the 90 % band in per cent, by channel and block."""
+    low, high = prediction.interval(LEVEL)
+    inside = (truth >= low) & (truth <= high) & mask
+    parts = [
+        (inside[:, a:b].sum((0, 1)), mask[:, a:b].sum((0, 1))) for a, b in blocks(len(mask[0]))
+    ]
+    shares = torch.stack([100 * held / asked for held, asked in parts], 1)
+    return np.asarray(shares.double().numpy())
+
+
+def _columns(found: Sequence[Mapping[str, float | Cube]]) -> dict[str, Cube]:
+    """What every group has, stacked."""
+    shared = [k for k in found[0] if all(k in each for each in found)]
+    return {k: np.stack([np.asarray(each[k], dtype=np.float64) for each in found]) for k in shared}
+
+
+def _rows(prediction: Prediction, rows: Bool[Tensor, " row"]) -> Prediction:
     p = prediction.predictive
 
     def picked(part: Tensor | None) -> Tensor | None:
-        return None if part is None else part.expand(part.shape[0], *p.location.shape[1:])[:, rows]
+        return None if part is None else part.expand_as(p.location)[:, rows]
 
     chosen = replace(
         p,
         location=p.location[:, rows],
         noise=picked(p.noise),
         epistemic=picked(p.epistemic),
-        draws=picked(p.draws),
+        draws=None if p.draws is None else p.draws[:, rows],
     )
-    return replace(prediction, predictive=chosen)
-
-
-def _joined(predictions: Sequence[tuple[Sequence[int], Prediction]]) -> Prediction:
-    """Predictions of all folds as one, rows in their own order."""
-    order = torch.tensor([row for rows, _ in predictions for row in rows]).argsort()
-    parts = [p.predictive for _, p in predictions]
-
-    def joined(name: str) -> Tensor | None:
-        full = [_full(p, name) for p in parts]
-        known = [part for part in full if part is not None]
-        return torch.cat(known, 1)[:, order] if len(known) == len(full) else None
-
-    location = joined("location")
-    assert location is not None
-    whole = Predictive(
-        location=location,
-        noise=joined("noise"),
-        epistemic=joined("epistemic"),
-        joint=parts[0].joint,
-        draws=joined("draws"),
-    )
-    return replace(predictions[0][1], predictive=whole, lengths=None)
-
-
-def _full(p: Predictive, name: str) -> Tensor | None:
-    part: Tensor | None = getattr(p, name)
-    if part is None or name == "draws":
-        return part
-    return part.expand_as(p.location)
+    return replace(prediction, predictive=chosen, lengths=None)
