@@ -168,7 +168,7 @@ def test_few_groups_say_what_they_can_promise(count: int) -> None:
     """Their number, n / (n + 1), and by how much the bands became wider, counted here again."""
     raw, truth = walks(count, 700)
     with pytest.warns(
-        FewGroupsWarning, match=f"on {count} groups.* {count / (count + 1):.0%} is"
+        FewGroupsWarning, match=f"on {count} groups.* is {count / (count + 1):.0%};"
     ) as w:
         found = recalibrate("conformal", raw, truth)
     widths = [

@@ -302,12 +302,12 @@ def _few(found: Conformal, answer: Answer) -> str:
     ]
     rank = math.ceil((groups + 1) * _WARNED - 1e-9)
     return (
-        f"conformal bands fitted on {groups} groups: a {_WARNED:.0%} band with a guarantee for a "
-        f"new group takes the {rank}th smallest of the groups' scores, and there are {groups}; "
-        f"{promised(_WARNED, groups):.0%} is the most that they can promise. The band given "
-        f"counts their entries as {found.worth:.1f} independent ones (good for "
-        f"{found.reach:.0%}, continued like a Gaussian's beyond) and is on average "
-        f"{widths[0] / widths[1]:.2f} times as wide as the raw one; nothing is promised for it"
+        f"conformal bands fitted on {groups} groups: the most that so few can promise for a new "
+        f"group is {promised(_WARNED, groups):.0%}; a {_WARNED:.0%} band with a guarantee takes the "
+        f"score of rank {rank}, and there are {groups}. The band given counts the groups' entries "
+        f"as {found.worth:.1f} independent ones (enough for {found.reach:.0%}, continued like a "
+        f"Gaussian's beyond) and is on average {widths[0] / widths[1]:.2f} times as wide as the raw "
+        "one; nothing is promised for it"
     )
 
 
