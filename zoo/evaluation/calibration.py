@@ -303,11 +303,11 @@ def _few(found: Conformal, answer: Answer) -> str:
     rank = math.ceil((groups + 1) * _WARNED - 1e-9)
     return (
         f"conformal bands fitted on {groups} groups: the most that so few can promise for a new "
-        f"group is {promised(_WARNED, groups):.0%}; a {_WARNED:.0%} band with a guarantee takes the "
-        f"score of rank {rank}, and there are {groups}. The band given counts the groups' entries "
-        f"as {found.worth:.1f} independent ones (enough for {found.reach:.0%}, continued like a "
-        f"Gaussian's beyond) and is on average {widths[0] / widths[1]:.2f} times as wide as the raw "
-        "one; nothing is promised for it"
+        f"group is {promised(_WARNED, groups):.0%}; a {_WARNED:.0%} band with a guarantee takes "
+        f"the score of rank {rank}, and there are {groups}. The band given counts the groups' "
+        f"entries as {found.worth:.1f} independent ones (enough for {found.reach:.0%}, continued "
+        f"like a Gaussian's beyond) and is on average {widths[0] / widths[1]:.2f} times as wide "
+        "as the raw one; nothing is promised for it"
     )
 
 
