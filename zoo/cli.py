@@ -244,20 +244,12 @@ def leaderboard(
     name: Annotated[
         str | None, typer.Argument(help="A protocol; none lists all.", metavar="PROTOCOL")
     ] = None,
-    models: Annotated[
-        str,
-        typer.Option(
-            help="Entries, separated by commas; a+b is an ensemble; default: the protocol's."
-        ),
-    ] = "",
+    models: Annotated[str, typer.Option(help="Entries, a comma between; a+b: an ensemble.")] = "",
     seeds: Annotated[int, typer.Option(help="Trainings of each entry, seeds 0, 1, …")] = 1,
     folds: Annotated[
         int, typer.Option(help="Folds of whole groups: one judged, one calibrates, others train.")
     ] = 4,
-    data: Annotated[
-        str | None,
-        typer.Option("--data", help="Instead of a protocol: movements by name (see `zoo data`)."),
-    ] = None,
+    data: Annotated[str | None, typer.Option(help="Not a protocol: movements by name.")] = None,
     seen: Annotated[int, typer.Option(help="With --data: frames observed.")] = 0,
     horizon: Annotated[int, typer.Option(help="With --data: frames to forecast.")] = 0,
     hidden: Annotated[

@@ -213,6 +213,7 @@ def test_saved_and_loaded_runs_predict_the_same(name: str, tmp_path: object) -> 
 
 
 @every
+@pytest.mark.filterwarnings("ignore::zoo.errors.FewGroupsWarning")
 def test_calibration_is_kept_in_the_saved_run(name: str, tmp_path: object) -> None:
     entry = CATALOGUE[name]
     data = data_of(entry)

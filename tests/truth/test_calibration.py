@@ -19,10 +19,10 @@ from zoo.evaluation.calibration import (
     RECALIBRATIONS,
     Conformal,
     Scale,
-    promised,
     recalibrate,
     recalibration_from_state,
 )
+from zoo.evaluation.promise import promised
 from zoo.evaluation.scores import score
 from zoo.prediction import Prediction, Predictive
 
@@ -168,7 +168,7 @@ def test_few_groups_say_what_they_can_promise(count: int) -> None:
     """Their number, n / (n + 1), and by how much the bands became wider, counted here again."""
     raw, truth = walks(count, 700)
     with pytest.warns(
-        FewGroupsWarning, match=f"on {count} groups.* is {count / (count + 1):.0%};"
+        FewGroupsWarning, match=f"on {count} groups.* is {count / (count + 1):.0%},"
     ) as w:
         found = recalibrate("conformal", raw, truth)
     widths = [

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from support import movements
 
 import zoo
-from zoo.errors import DamagedRunError, NoJointSamplesError, NotCapableError
+from zoo.errors import DamagedRunError, FewGroupsWarning, NoJointSamplesError, NotCapableError
 from zoo.mixtures import Predictive, pooled
 from zoo.questions import Setup
 
@@ -71,7 +71,8 @@ def test_an_ensemble_is_calibrated_and_scored_like_a_run() -> None:
 def test_an_ensemble_on_disk_predicts_the_same(tmp_path: Path) -> None:
     """Saved with its calibration, loaded again: equal bits; a foreign folder is refused."""
     ensemble = zoo.Ensemble(members=members("mean", "ar"))
-    ensemble.calibrate(movements()[6:], setup=SETUP)
+    with pytest.warns(FewGroupsWarning, match="on 2 groups"):
+        ensemble.calibrate(movements()[6:], setup=SETUP)
     again = zoo.Ensemble.load(ensemble.save(tmp_path / "both"))
     data = movements()[:6].frames(0, 12)
     before, after = (e.forecast(data, horizon=12).interval(0.9) for e in (ensemble, again))

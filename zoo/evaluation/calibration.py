@@ -7,8 +7,6 @@ group weighs the same, and scores that set a level come from groups left out of 
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from statistics import NormalDist
@@ -17,7 +15,7 @@ from typing import Any, ClassVar, Protocol, Self
 import torch
 from torch import Tensor
 
-from zoo.errors import FewGroupsWarning, UnknownNameError
+from zoo.errors import UnknownNameError
 from zoo.evaluation.answers import Answer, Groups
 from zoo.evaluation.curve import Curve
 from zoo.evaluation.factors import By, Factors, crossed, standardised
@@ -29,6 +27,7 @@ from zoo.evaluation.pool import (
     normal_score,
     scores_of_draws,
 )
+from zoo.evaluation.promise import warn_of_few
 from zoo.prediction import Prediction, Predictive, Recalibration
 
 __all__ = [
@@ -36,12 +35,9 @@ __all__ = [
     "Conformal",
     "Isotonic",
     "Scale",
-    "promised",
     "recalibrate",
     "recalibration_from_state",
 ]
-
-_WARNED = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,7 +254,7 @@ def recalibrate(
 
     ``kind`` is ``conformal``, ``isotonic`` or ``scale``; ``by`` says which factors are fitted
     beside the common one. Groups are those of :func:`~zoo.evaluation.answers.clusters`. Of too few
-    for a conformal 90 % band with a guarantee (see :func:`promised`) a
+    for a conformal 90 % band with a guarantee (see :func:`~zoo.evaluation.promise.promised`) a
     :class:`~zoo.errors.FewGroupsWarning` says what they can promise and what the bands became.
 
     >>> import torch
@@ -274,41 +270,9 @@ def recalibrate(
     if answer.groups < 2:
         raise ValueError("recalibration needs at least 2 groups (movements or items); got 1")
     found = _kind(kind).fit(answer, by)
-    if isinstance(found, Conformal) and promised(_WARNED, answer.groups) < _WARNED:
-        warnings.warn(_few(found, answer), FewGroupsWarning, stacklevel=2)
+    if isinstance(found, Conformal):
+        warn_of_few(answer, found, found.worth, found.reach)
     return found
-
-
-def promised(level: float, groups: int) -> float:
-    """Coverage that conformal bands of ``groups`` exchangeable groups can promise a new one.
-
-    With n groups it takes the ⌈(n + 1) level⌉-th smallest of n scores; where that is beyond n, no
-    finite band has the level, and the widest, up to the largest score, has n / (n + 1). Vovk,
-    Gammerman & Shafer, *Algorithmic learning in a random world*, 2005; for groups Lee, Barber &
-    Willett, *Distribution-free inference with hierarchical data*, 2023.
-
-    >>> promised(0.9, 9), promised(0.9, 3)
-    (0.9, 0.75)
-    """
-    return level if math.ceil((groups + 1) * level - 1e-9) <= groups else groups / (groups + 1)
-
-
-def _few(found: Conformal, answer: Answer) -> str:
-    """What few groups can promise at 90 %, what the bands rest on instead, and their width."""
-    raw, groups = answer.prediction, answer.groups
-    widths = [
-        (high - low)[answer.mask].double().mean()
-        for low, high in (p.interval(_WARNED) for p in (raw.recalibrated(found), raw))
-    ]
-    rank = math.ceil((groups + 1) * _WARNED - 1e-9)
-    return (
-        f"conformal bands fitted on {groups} groups: the most that so few can promise for a new "
-        f"group is {promised(_WARNED, groups):.0%}; a {_WARNED:.0%} band with a guarantee takes "
-        f"the score of rank {rank}, and there are {groups}. The band given counts the groups' "
-        f"entries as {found.worth:.1f} independent ones (enough for {found.reach:.0%}, continued "
-        f"like a Gaussian's beyond) and is on average {widths[0] / widths[1]:.2f} times as wide "
-        "as the raw one; nothing is promised for it"
-    )
 
 
 def recalibration_from_state(meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Recalibration:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from zoo.evaluation.calibration import promised
+from zoo.evaluation.promise import promised
 from zoo.leaderboard.cells import Found
 from zoo.leaderboard.judge import LEVEL
 from zoo.leaderboard.protocols import BASELINES
