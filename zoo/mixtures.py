@@ -50,6 +50,10 @@ class Deferred:
                 self._made = self._make()
         return self._made
 
+    def __reduce__(self) -> tuple[Callable[[Tensor], Tensor], tuple[Tensor]]:
+        """Another process gets the draws themselves."""
+        return torch.as_tensor, (self.tensor(),)
+
     def map(self, change: Callable[[Tensor], Tensor], shape: Sequence[int]) -> Deferred:
         """The same draws, changed once they are made."""
         make = self._make

@@ -98,7 +98,7 @@ def test_cells_are_kept_by_data_and_code(tmp_path: Path, monkeypatch: pytest.Mon
 def test_two_processes_find_what_one_finds(tmp_path: Path) -> None:
     """Cells of a protocol that was made in this process, computed apart."""
     asked = own_protocol(movements(), seen=12, horizon=12)
-    some = [cell("promp", replace(NOTHING, judged=(k,))) for k in range(2)]
+    some = [cell("promp", Fold(train=(4, 5, 6 + k), calibration=(), judged=(k,))) for k in (0, 1)]
     apart = cells.compute_all(some, tmp_path / "two", asked, 2, lambda found: None)
     alone = cells.compute_all(some, tmp_path / "one", asked, 1, lambda found: None)
     for two, one in zip(apart, alone, strict=True):
