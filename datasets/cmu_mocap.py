@@ -20,7 +20,14 @@ from zoo.datasets.cmu_files import BASE, HASHES
 from zoo.datasets.records import Sequences
 from zoo.datasets.skeleton import Skeleton
 from zoo.datasets.split import nearest
-from zoo.datasets.store import FileFormatError, MissingDataError, download, find, sought
+from zoo.datasets.store import (
+    FileFormatError,
+    MissingDataError,
+    download,
+    find,
+    listed,
+    sought,
+)
 from zoo.errors import UnknownNameError
 
 __all__ = ["ACKNOWLEDGEMENT", "CONSTANT", "load", "load_skeleton"]
@@ -57,6 +64,8 @@ class Movement:
 
 
 MOVEMENTS = {
+    "07-walk": Movement(subject="07", name="walk", trials=(1, 2, 3, 6, 7, 8, 9, 10, 11)),
+    "08-walk": Movement(subject="08", name="walk", trials=(1, 2, 3, 4, 6, 8, 9, 10)),
     "35-walk": Movement(subject="35", name="walk", trials=tuple(range(1, 17))),
     "35-run": Movement(subject="35", name="run", trials=tuple(range(17, 25))),
     "49-balance": Movement(subject="49", name="balance", trials=(18,)),
@@ -71,8 +80,11 @@ def load(
     rate: float | None = None,
     angles: Kind = "joint",
 ) -> Sequences:
-    """Trials of a named movement (``35-walk``) or a single one (``35_01``): angles in rad.
+    """Trials of a movement (``35-walk``), of a subject (``07``) or one (``35_01``): angles in rad.
 
+    A subject's trials are all AMC files that the folder has of it (of 35 not the runs, which are
+    at 30 Hz); the channels of all subjects are the same, so that :func:`zoo.concatenate` joins
+    them, with the group columns ``trial``, ``subject`` and ``movement``.
     Every trial is brought to ``frames`` frames as in §6.3.1, or to ``rate`` Hz where that is given;
     ``frames=None`` leaves the recording (120 Hz; 30 Hz for the runs). ``angles="joint"`` gives the
     50 angles of §5.3.1: without the root, whose frame is fixed, and without six that the markers do
@@ -83,7 +95,7 @@ def load(
     """
     if angles not in get_args(Kind):
         raise ValueError(f"angles must be one of {', '.join(get_args(Kind))}; got {angles!r}")
-    movement = _movement(what)
+    movement = _movement(what, folder)
     acknowledge()
     skeleton = load_skeleton(movement.subject, folder=folder)
     names = skeleton.channels
@@ -102,7 +114,7 @@ def load(
         groups={
             "trial": [trial for trial, _ in recordings],
             "subject": [movement.subject] * len(arrays),
-            "movement": [movement.name] * len(arrays),
+            "movement": [_shown(movement.subject, number) for number in movement.trials],
         },
         notes=notes,
         name=f"{DATASET}/{what}",
@@ -124,18 +136,41 @@ def acknowledge() -> None:
     print(ACKNOWLEDGEMENT, file=sys.stderr)
 
 
-def _movement(what: str) -> Movement:
+def _movement(what: str, folder: str | Path | None) -> Movement:
     if what in MOVEMENTS:
         return MOVEMENTS[what]
+    if re.fullmatch(r"\d{2,3}", what):
+        return Movement(subject=what, name="all", trials=_trials(what, folder))
     trial = re.fullmatch(r"(\d{2,3})_(\d{2,3})", what)
     if trial is None:
         hint = nearest(what, MOVEMENTS)
         raise UnknownNameError(
-            f"no CMU movement {what!r}{hint}; single trials are named SUBJECT_TRIAL, such as 35_01"
+            f"no CMU movement {what!r}{hint}; single trials are named SUBJECT_TRIAL, such as "
+            "35_01, all of a subject by its number, such as 07"
         )
     subject, number = trial[1], int(trial[2])
-    known = (m.name for m in MOVEMENTS.values() if m.subject == subject and number in m.trials)
-    return Movement(subject=subject, name=next(known, "unknown"), trials=(number,))
+    return Movement(subject=subject, name=_shown(subject, number), trials=(number,))
+
+
+def _shown(subject: str, trial: int) -> str:
+    """What a trial shows, where that is known."""
+    known = (m.name for m in MOVEMENTS.values() if m.subject == subject and trial in m.trials)
+    return next(known, "unknown")
+
+
+def _trials(subject: str, folder: str | Path | None) -> tuple[int, ...]:
+    """Numbers of the trials at hand, else of those that can be downloaded."""
+    pattern = f"{subject}/{subject}_*.amc"
+    here = [file.stem for file in listed(pattern, dataset=DATASET, folder=folder)]
+    remote = [Path(path).stem for path in HASHES if folder is None and Path(path).match(pattern)]
+    numbers = sorted({int(stem.partition("_")[2]) for stem in here or remote})
+    if not numbers:
+        raise MissingDataError(
+            f"{DATASET}: no trial of subject {subject} is {sought(folder)}; fetch {BASE}{subject}/ "
+            f"yourself and put it into $MOVEZOO_DATA/{DATASET}/{subject}, or name its folder with "
+            "folder=..."
+        )
+    return tuple(numbers)
 
 
 def _is_joint_angle(channel: str) -> bool:

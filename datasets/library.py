@@ -34,7 +34,8 @@ class Family:
 
 FAMILIES = {
     "cmu-mocap": Family(
-        loader="zoo.datasets.cmu_mocap:load", listed=("35-walk", "35-run", "49-balance")
+        loader="zoo.datasets.cmu_mocap:load",
+        listed=("35-walk", "35-run", "49-balance", "07", "08", "35", "49"),
     ),
     "uci": Family(loader="zoo.datasets.uci:load", listed=("concrete", "energy", "yacht")),
 }

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FileFormatError", "MissingDataError", "download", "find", "require"]
+__all__ = ["FileFormatError", "MissingDataError", "download", "find", "listed", "require"]
 
 VARIABLE = "MOVEZOO_DATA"
 
@@ -39,6 +39,20 @@ def find(relative: str, *, dataset: str, folder: str | Path | None = None) -> Pa
         return None
     places = (Path(dataset, relative), Path(relative), Path(Path(relative).name))
     return next((f for p in places if (f := Path(root) / p).is_file()), None)
+
+
+def listed(pattern: str, *, dataset: str, folder: str | Path | None = None) -> list[Path]:
+    """All files like ``07/07_*.amc`` in the first place that has any, sought as :func:`find` does.
+
+    >>> listed("07/*.amc", dataset="cmu-mocap", folder="/nowhere")
+    []
+    """
+    root = folder if folder is not None else os.environ.get(VARIABLE)
+    if not root:
+        return []
+    places = (f"{dataset}/{pattern}", pattern, Path(pattern).name)
+    found = (sorted(Path(root).glob(place)) for place in places)
+    return next((files for files in found if files), [])
 
 
 def require(relative: str, *, dataset: str, folder: str | Path | None, advice: str) -> Path:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from zoo.cards import card
     from zoo.catalogue import list_models
+    from zoo.datasets.joined import concatenate
     from zoo.datasets.library import list_data, load_data
     from zoo.datasets.records import Pairs, Sequences
     from zoo.ensemble import Ensemble, fit_ensemble
@@ -33,6 +34,7 @@ __all__ = [
     "Table",
     "__version__",
     "card",
+    "concatenate",
     "create",
     "evaluate",
     "fit",
@@ -53,6 +55,7 @@ _HOME = {
     "Setup": "zoo.questions",
     "Table": "zoo.evaluation.table",
     "card": "zoo.cards",
+    "concatenate": "zoo.datasets.joined",
     "create": "zoo.run",
     "evaluate": "zoo.run",
     "fit": "zoo.fitting",

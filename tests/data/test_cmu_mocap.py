@@ -109,6 +109,43 @@ def test_walks_of_subject_35(walks: Sequences) -> None:
 
 
 @real
+@pytest.mark.parametrize(("subject", "trials"), [("07", 9), ("08", 8), ("35", 16), ("49", 1)])
+def test_a_subject_is_all_its_trials(subject: str, trials: int) -> None:
+    data = zoo.load_data(f"cmu-mocap/{subject}", frames=None)
+    files = Path(DATA, "cmu-mocap", subject).glob("*.amc")
+    assert data.groups["trial"] == tuple(sorted(f.stem for f in files)) and len(data) == trials
+    assert set(data.groups["subject"]) == {subject} and data.rate == 120
+    assert "unknown" not in data.groups["movement"]
+    one = zoo.load_data(f"cmu-mocap/{data.groups['trial'][0]}", frames=None)
+    assert np.array_equal(one.arrays[0], data.arrays[0])
+
+
+@real
+def test_subjects_are_joined_and_split_by_subject() -> None:
+    parts = [zoo.load_data(f"cmu-mocap/{s}", frames=None, rate=30.0) for s in ("07", "08", "35")]
+    whole = zoo.concatenate(parts)
+    assert len(whole) == 9 + 8 + 16 and len(whole.channels) == 50 and whole.rate == 30
+    assert whole.where(subject="08").groups["trial"] == parts[1].groups["trial"]
+    for array, same in zip(whole.where(subject="08").arrays, parts[1].arrays, strict=True):
+        assert np.array_equal(array, same)
+    split = whole.split(by="subject", parts=(1 / 3, 1 / 3, 1 / 3))
+    assert sorted("".join(set(p.groups["subject"])) for p in split) == ["07", "08", "35"]
+    equal = zoo.concatenate([zoo.load_data(f"cmu-mocap/{s}") for s in ("07", "49")])
+    assert equal.values.shape == (10, 70, 50) and equal.layout.rate is None
+
+
+def test_a_subject_without_files_is_named(tmp_path: Path) -> None:
+    write(tmp_path, "90.asf", ASF)
+    with pytest.raises(MissingDataError, match="no trial of subject 90 is in the folder"):
+        zoo.load_data("cmu-mocap/90", folder=tmp_path)
+    for number in (3, 1):
+        write(tmp_path, f"90_{number:02d}.amc", AMC)
+    data = zoo.load_data("cmu-mocap/90", folder=tmp_path, frames=None)
+    assert data.groups["trial"] == ("90_01", "90_03")
+    assert data.groups["movement"] == ("unknown", "unknown")
+
+
+@real
 def test_jumps_of_trial_14_and_19_are_undone_and_told() -> None:
     walk = zoo.load_data("cmu-mocap/35_14", frames=None)
     run = zoo.load_data("cmu-mocap/35-run", frames=None)
