@@ -13,7 +13,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.dynamics.plan import Plan
-from zoo.guides.recurrence import FilteringNoise, NoiseNetwork
+from zoo.guides.recurrence import FilteringNoise, NoiseNetwork, Stacked
 from zoo.nn.mlp import trunk
 from zoo.nn.moments import GaussianHead
 from zoo.types import Batch, Layout
@@ -108,15 +108,21 @@ class FilteringGuide(nn.Module):
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
             z = pyro.sample("z", normal(self.encoder(h), 2))
             velocity = pyro.sample("velocity", normal(self._velocity(h), 1))
-            noise = FilteringNoise(
-                self.noise,
-                self.noise.features(batch.values.transpose(0, 1)[1:]),
-                model.initial_state(z[:, 0], velocity),
-                model.drive(plan, batch),
-                model.transition,
-                model.noise_gain(),
-            )
-            pyro.sample("epsilon", noise)
+            features = self.noise.features(batch.values.transpose(0, 1)[1:])
+            first = z.reshape(-1, *z.shape[-3:])[:, :, 0]
+            speed = velocity.reshape(-1, *velocity.shape[-2:])
+            parts = [
+                FilteringNoise(
+                    self.noise,
+                    features,
+                    model.initial_state(*begin),
+                    model.drive(each, batch),
+                    model.transition,
+                    model.noise_gain(),
+                )
+                for *begin, each in zip(first, speed, plan.draws(), strict=True)
+            ]
+            pyro.sample("epsilon", parts[0] if z.ndim == 3 else Stacked(parts, z.shape[:-3]))
 
     def plan(self, batch: Batch) -> Plan:
         """What is recognised of whole movements."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar, Self
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.distributions import kl
 
-__all__ = ["FilteringNoise", "NoiseNetwork", "RecurrentNoise"]
+__all__ = ["FilteringNoise", "NoiseNetwork", "RecurrentNoise", "Stacked"]
 
 ROOT_SCALE = 0.1
 
@@ -155,11 +156,11 @@ class RecurrentNoise(TorchDistribution):
         """Mean and standard deviation of every step along the states that ``value`` leads to."""
         ...
 
-    def expand(self, batch_shape: Any, _instance: Any = None) -> Self:
-        """The distribution itself: its windows are independent already."""
-        if torch.Size(batch_shape) != self.batch_shape:
-            raise ValueError(f"batch shape {batch_shape} for {tuple(self.batch_shape)} windows")
-        return self
+    def expand(self, batch_shape: Any, _instance: Any = None) -> RecurrentNoise | Stacked:
+        """The distribution itself, or draws of it one after the other."""
+        if torch.Size(batch_shape) == self.batch_shape:
+            return self
+        return Stacked([self], ()).expand(batch_shape)
 
     def rsample(
         self, sample_shape: Any = (), noise: Tensor | None = None
@@ -189,6 +190,48 @@ class RecurrentNoise(TorchDistribution):
             raise ValueError("no draw has been made")
         value, η, σ = self._kept
         return value.transpose(0, 1) - σ * η, σ
+
+
+class Stacked(TorchDistribution):
+    """Independent distributions of one shape side by side, along the axes ``lead``.
+
+    Vectorised particles of a recurrence: each part runs its own.
+    """
+
+    has_rsample = True
+    arg_constraints: ClassVar[dict[str, Any]] = {}
+    support = constraints.independent(constraints.real, 2)
+
+    def __init__(self, parts: Sequence[RecurrentNoise], lead: Sequence[int]) -> None:
+        """``parts`` in the order of the axes ``lead``."""
+        self.parts, self.lead = list(parts), torch.Size(lead)
+        batch_shape = self.lead + parts[0].batch_shape
+        super().__init__(batch_shape, parts[0].event_shape, validate_args=False)
+
+    def expand(self, batch_shape: Any, _instance: Any = None) -> Stacked:
+        """The same distributions again and again, along axes before all others."""
+        shape = torch.Size(batch_shape)
+        known = len(self.batch_shape)
+        if len(shape) < known or shape[len(shape) - known :] != self.batch_shape:
+            raise ValueError(f"batch shape {tuple(shape)} for {tuple(self.batch_shape)} windows")
+        new = shape[: len(shape) - known]
+        return self if not new else Stacked(self.parts * new.numel(), new + self.lead)
+
+    def rsample(self, sample_shape: Any = ()) -> Float[Tensor, "*sample window step latent"]:
+        """One reparameterised draw of every part."""
+        if tuple(sample_shape):
+            raise ValueError(f"one draw at a time; got sample_shape {tuple(sample_shape)}")
+        value: Tensor = torch.stack([p.rsample() for p in self.parts]).unflatten(0, self.lead)
+        return value
+
+    def log_prob(
+        self, value: Float[Tensor, "*sample window step latent"]
+    ) -> Float[Tensor, "*sample window"]:
+        """Log density of every part's value."""
+        values = value.reshape(len(self.parts), *value.shape[-3:])
+        each = [part.log_prob(v) for part, v in zip(self.parts, values, strict=True)]
+        total: Tensor = torch.stack(each).unflatten(0, self.lead)
+        return total
 
 
 class FilteringNoise(RecurrentNoise):

@@ -6,8 +6,10 @@ import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, get_args, get_type_hints
 
+import pyro
 import torch
 from pydantic import TypeAdapter, ValidationError
 from torch import nn
@@ -15,10 +17,11 @@ from torch import nn
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import UnknownNameError
+from zoo.inference.elbo import Program
 from zoo.inference.posterior import seeded
 from zoo.registry import Entry, Scaling, load
 from zoo.strategies import Inference, Svi
-from zoo.types import Layout
+from zoo.types import Batch, Layout
 
 __all__ = ["Assembly", "assemble", "create", "options"]
 
@@ -58,7 +61,40 @@ class Assembly:
     def parameters(self) -> int:
         """Number of trainable numbers in model and guide."""
         modules = [self.model] + ([] if self.guide is None else [self.guide])
-        return sum(p.numel() for m in modules for p in m.parameters())
+        return sum(p.numel() for m in modules for p in m.parameters() if p.requires_grad)
+
+    def programs(self) -> tuple[Program, Program]:
+        """Model and guide for Pyro's own inference, their parameters in its parameter store.
+
+        ``pyro.infer.SVI`` learns what it finds there; of the bare modules it finds nothing. The
+        names are those of the parts, so that ``pyro.clear_param_store()`` comes before another
+        training. The guide of an entry without one draws nothing.
+
+        >>> import numpy as np, pyro, torch, zoo
+        >>> from pyro.infer import SVI, Predictive, Trace_ELBO
+        >>> from zoo.inference.loader import whole
+        >>> x = np.random.default_rng(0).normal(size=(4, 20, 3))
+        >>> data = zoo.Sequences.from_arrays(x, rate=30.0).to(dtype=torch.float32)
+        >>> assembly, batch = zoo.create("vae", data, latent_dim=2), whole(data)
+        >>> model, guide = assembly.programs()
+        >>> loss = SVI(model, guide, pyro.optim.Adam({"lr": 1e-3}), Trace_ELBO()).step(batch)
+        >>> model(batch.unobserved()).shape
+        torch.Size([4, 20, 3])
+        >>> prior = Predictive(model, num_samples=7, parallel=True)
+        >>> prior(batch.unobserved())["x"].shape
+        torch.Size([7, 4, 20, 3])
+        >>> posterior = Predictive(model, guide=guide, num_samples=7, parallel=True)
+        >>> posterior(batch.unobserved())["x"].shape
+        torch.Size([7, 4, 20, 3])
+        """
+        return partial(_registered, "model", self.model), partial(_registered, "guide", self.guide)
+
+
+def _registered(name: str, part: nn.Module | None, batch: Batch) -> Any:
+    if part is None:
+        return None
+    pyro.module(name, part)
+    return part(batch)
 
 
 def create(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 from jaxtyping import Float
@@ -24,6 +24,16 @@ class Plan:
     start: Float[Tensor, "*sequence latent"] | None = None
     phase: Float[Tensor, "*sequence"] | None = None
     tempo: Float[Tensor, "*sequence"] | None = None
+
+    def draws(self) -> list[Plan]:
+        """The plans of each draw, where the values have an axis of draws before the movements."""
+        axes = {"w": 3, "goal": 2, "start": 2, "phase": 1, "tempo": 1}
+        given = {name: v for name in axes if (v := getattr(self, name)) is not None}
+        flat = {name: v.reshape(-1, *v.shape[v.ndim - axes[name] :]) for name, v in given.items()}
+        return [
+            replace(self, **dict(zip(flat, one, strict=True)))
+            for one in zip(*flat.values(), strict=True)
+        ]
 
     @classmethod
     def of(cls, drawn: dict[str, Tensor]) -> Self:

@@ -9,10 +9,9 @@ from typing import Any
 
 import pyro
 import torch
-from pyro.distributions.util import scale_and_mask
-from pyro.infer.enum import get_importance_trace
+from pyro.infer import Trace_ELBO
 from pyro.poutine.messenger import Messenger
-from pyro.poutine.subsample_messenger import _Subsample
+from pyro.poutine.util import site_is_subsample
 from torch import Tensor, nn
 
 from zoo.types import Batch
@@ -30,7 +29,7 @@ __all__ = [
 ]
 
 Program = nn.Module | Callable[[Batch], Any]
-Site = dict[str, Any]
+Site = Any
 
 
 @dataclass(frozen=True)
@@ -133,18 +132,12 @@ def check(model: Program, guide: Program, batch: Batch) -> None:
     with torch.no_grad(), pyro.validation_enabled(True):
         drawn = sites(model, guide, batch)
         _check_match(drawn)
-        get_importance_trace("flat", math.inf, model, guide, (batch,), {})
+        Trace_ELBO().loss(model, guide, batch)
 
 
 def log_density(site: Site) -> Tensor:
     """Log density of a site with its mask and its scale, summed."""
-    log_p: Tensor = site["fn"].log_prob(site["value"], *site["args"], **site["kwargs"])
-    scale, mask = site["scale"], site["mask"]
-    if mask is not None:
-        log_p = scale_and_mask(log_p, scale=scale, mask=mask)
-    elif scale != 1.0:
-        return log_p.sum().mul(scale)
-    return log_p.sum()
+    return _weighted(site["fn"].log_prob(site["value"], *site["args"], **site["kwargs"]), site)
 
 
 class _Record(Messenger):
@@ -158,7 +151,7 @@ class _Record(Messenger):
     @property
     def real(self) -> dict[str, Site]:
         """The sites without the subsamples of plates."""
-        return {n: s for n, s in self.seen.items() if not isinstance(s["fn"], _Subsample)}
+        return {n: s for n, s in self.seen.items() if not site_is_subsample(s)}
 
     def _pyro_sample(self, message: Site) -> None:
         if message["name"] in self.given and not message["is_observed"]:
@@ -175,10 +168,21 @@ def _divergence(q: Site, p: Site, *, closed: bool) -> Tensor:
         except NotImplementedError:
             pass
         else:
-            full = kl.expand(q["fn"].batch_shape)
-            scaled: Tensor = scale_and_mask(full, scale=q["scale"], mask=q["mask"]).sum()
-            return scaled
+            return _weighted(kl.expand(q["fn"].batch_shape), q)
     return log_density(q) - log_density(p)
+
+
+def _weighted(each: Tensor, site: Site) -> Tensor:
+    """Terms of a site, summed where its mask is True, times its scale."""
+    scale, mask = site["scale"], site["mask"]
+    if isinstance(mask, Tensor):
+        each = torch.where(mask, each, 0.0)
+    elif mask is False:
+        return each.new_zeros(())
+    if isinstance(scale, Tensor) and scale.ndim:
+        return (scale * each).sum()
+    total = each.sum()
+    return total if scale == 1.0 else total * scale
 
 
 def _check_match(drawn: Sites) -> None:

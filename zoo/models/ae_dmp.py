@@ -142,11 +142,13 @@ class AeDmp(nn.Module):
             θ = pyro.sample("theta", weights.expand(θ_shape).to_event(2))
             path = self.imitator.roll_out(θ) if self.integrated else y
             x = dist.Normal(self.decoder(path), self.σ).mask(_all(batch.mask))
-            pyro.sample("x", x.to_event(2), obs=batch.values)
+            pyro.sample("x", x.to_event(2), obs=batch.given(batch.values))
             if self.integrated:
                 f, f_target = self.imitator.forces(y, θ)
                 force = dist.Normal(f, self.σ / self.config.penalty**0.5)
-                pyro.sample("f", force.mask(_steps(batch.mask)).to_event(2), obs=f_target)
+                pyro.sample(
+                    "f", force.mask(_steps(batch.mask)).to_event(2), obs=batch.given(f_target)
+                )
 
     def _weight_prior(self, scale: float) -> Float[Tensor, ""]:
         """log p of the decoder's weights, N(0, ``scale``²) each, up to a constant."""

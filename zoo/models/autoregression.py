@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
+from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
@@ -22,6 +22,7 @@ from zoo.models.baseline import (
     moments,
     movement_groups,
     movements_of,
+    observe_in_turn,
     seen_entries,
 )
 from zoo.prediction import Predictive
@@ -152,16 +153,20 @@ class Autoregression(nn.Module):
 
     def forward(self, batch: Batch) -> Tensor:
         """The generative program, without frames that miss an entry or whose past does."""
-        x, mask = batch.values, seen_entries(batch).all(-1)
-        chain, whole = self.chain, mask.clone()
-        for lag in chain.lags:
-            whole[:, lag:] &= mask[:, :-lag]
-        level = torch.tensor([chain.level(t) for t in range(x.shape[1])], device=x.device)
-        root = torch.linalg.cholesky(self.innovation)[level]
-        step = dist.MultivariateNormal(chain.predicted(x), scale_tril=root)
-        with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
-            found: Tensor = pyro.sample("x", step.mask(whole).to_event(1), obs=x)
-        return found
+        chain, roots = self.chain, torch.linalg.cholesky(self.innovation)
+
+        def step(x: Tensor, observed: Tensor, frames: range) -> TorchDistribution:
+            complete = observed.all(-1)
+            whole = complete.clone()
+            for lag in chain.lags:
+                whole[:, lag:] &= complete[:, :-lag]
+            level = torch.tensor([chain.level(t) for t in frames], device=x.device)
+            mean = chain.predicted(x)[:, frames]
+            now = dist.MultivariateNormal(mean, scale_tril=roots[level])
+            masked: TorchDistribution = now.mask(whole[:, frames])
+            return masked
+
+        return observe_in_turn(batch, step)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from zoo.datasets.records import Pairs, Sequences
+from zoo.dynamics.ancestral import Ancestral, Law
 from zoo.errors import NotFittedError
 from zoo.types import Batch
 
@@ -19,7 +20,9 @@ __all__ = [
     "moments",
     "movement_groups",
     "movements_of",
+    "normal",
     "observe",
+    "observe_in_turn",
     "seen_entries",
 ]
 
@@ -75,7 +78,23 @@ def observe(batch: Batch, likelihood: dist.TorchDistribution) -> Tensor:
     """The observed site ``x``: the seen entries of every window under ``likelihood``."""
     with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
         site = likelihood.mask(seen_entries(batch)).to_event(2)
-        x: Tensor = pyro.sample("x", site, obs=batch.values)
+        x: Tensor = pyro.sample("x", site, obs=batch.given(batch.values))
+    return x
+
+
+def normal(
+    mean: Tensor, deviation: Tensor, observed: Bool[Tensor, "movement frame channel"]
+) -> dist.TorchDistribution:
+    """Independent entries of frames, those that are missing left out of the density."""
+    frames: dist.TorchDistribution = dist.Normal(mean, deviation).mask(observed).to_event(1)
+    return frames
+
+
+def observe_in_turn(batch: Batch, law: Law) -> Tensor:
+    """The observed site ``x`` of movements whose every frame depends on those before it."""
+    with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
+        site = Ancestral(law, seen_entries(batch), batch.values.new_empty(0))
+        x: Tensor = pyro.sample("x", site, obs=batch.given(batch.values))
     return x
 
 

@@ -98,9 +98,10 @@ class Dvbf(nn.Module):
         mask = True if batch.mask is None else batch.mask
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
             w = pyro.sample("w", unit.expand([windows, time, self.latent_dim]).to_event(2))
-            mean = self.decoder(self.path(w, actions))
+            paths = [self.path(each, actions) for each in w.reshape(-1, *w.shape[-3:])]
+            mean = self.decoder(torch.stack(paths).reshape(w.shape))
             x = dist.Normal(mean, self.output_std, validate_args=False).mask(mask)
-            pyro.sample("x", x.to_event(2), obs=batch.values)
+            pyro.sample("x", x.to_event(2), obs=batch.given(batch.values))
 
     def path(
         self,

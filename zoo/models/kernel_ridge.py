@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import product
 from typing import ClassVar
 
-import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
+from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
@@ -22,7 +22,8 @@ from zoo.models.baseline import (
     moments,
     movement_groups,
     movements_of,
-    observe,
+    normal,
+    observe_in_turn,
     seen_entries,
 )
 from zoo.prediction import Predictive
@@ -152,14 +153,21 @@ class KernelRidge(nn.Module):
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every frame from the frames before it."""
         check_fitted("kernel-ridge", self.memory)
-        pairs = zip(batch.values, seen_entries(batch), strict=True)
-        x = torch.stack([carried(values, seen) for values, seen in pairs])
-        time = torch.arange(x.shape[1])[:, None].expand(x.shape[1:])
-        asked: dict[Pattern, list[int]] = {}
-        for t in range(x.shape[1]):
-            asked.setdefault(Pattern.at(t, time < t, self.config.context), []).append(t)
-        mean, noise = self._regressed(asked, x, torch.zeros_like(x), torch.zeros_like(x[0]))
-        return observe(batch, dist.Normal(mean, noise.clamp(min=self.config.noise_floor)))
+        time = torch.arange(batch.values.shape[1])[:, None].expand(batch.values.shape[1:])
+        patterns = [Pattern.at(t, time < t, self.config.context) for t in range(len(time))]
+        chosen = self._chosen(dict.fromkeys(patterns))
+
+        def step(values: Tensor, seen: Tensor, frames: range) -> TorchDistribution:
+            x = torch.stack([carried(v, s) for v, s in zip(values, seen, strict=True)])
+            asked: dict[Pattern, list[int]] = {}
+            for t in frames:
+                asked.setdefault(patterns[t], []).append(t)
+            empty = torch.zeros_like(x), torch.zeros_like(x[0])
+            mean, noise = self._regressed(asked, x, *empty, chosen)
+            deviation = noise.clamp(min=self.config.noise_floor).expand_as(mean)
+            return normal(mean[:, frames], deviation[:, frames], seen[:, frames])
+
+        return observe_in_turn(batch, step)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -187,13 +195,18 @@ class KernelRidge(nn.Module):
         return Predictive(location=mean[None, :, part], noise=noise[None, :, part], joint=True)
 
     def _regressed(
-        self, asked: Mapping[Pattern, list[int]], x: Tensor, mean: Tensor, noise: Tensor
+        self,
+        asked: Mapping[Pattern, list[int]],
+        x: Tensor,
+        mean: Tensor,
+        noise: Tensor,
+        chosen: tuple[Kernel, float] | None = None,
     ) -> tuple[Float[Tensor, "sequence time channel"], Float[Tensor, "time channel"]]:
         """``mean`` and ``noise`` with the entries asked for filled in."""
         if not asked:
             return mean, noise
         mean, noise = mean.clone(), noise.clone()
-        kernel, lines = self._chosen(asked)
+        kernel, lines = self._chosen(asked) if chosen is None else chosen
         for pattern, frames in asked.items():
             row = torch.arange(len(x)).repeat_interleave(len(frames))
             frame = torch.tensor(frames).repeat(len(x))

@@ -5,13 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float, Int
+from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.models.baseline import check_fitted, moments, movements_of, observe, seen_entries
+from zoo.models.baseline import (
+    check_fitted,
+    moments,
+    movements_of,
+    normal,
+    observe_in_turn,
+    seen_entries,
+)
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
@@ -77,11 +84,7 @@ class LastValue(nn.Module):
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every entry around the last one seen before it."""
         check_fitted("last-value", self.spread)
-        seen = seen_entries(batch)
-        time = torch.arange(batch.values.shape[1], device=seen.device)[:, None]
-        before = _last_seen(seen).roll(1, dims=1)
-        before[:, 0] = -1
-        return observe(batch, dist.Normal(*self._held(batch.values, before, time - before)))
+        return observe_in_turn(batch, self._step)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -97,6 +100,14 @@ class LastValue(nn.Module):
         constant = self.deviation * torch.randn_like(walk[:, :, :1])
         path = location + torch.where(last < 0, constant, walk)
         return Predictive(location=location[None], epistemic=spread, draws=path)
+
+    def _step(self, values: Tensor, seen: Tensor, frames: range) -> TorchDistribution:
+        """``frames`` given what was observed before them."""
+        time = torch.arange(values.shape[1], device=seen.device)[:, None]
+        before = _last_seen(seen).roll(1, dims=1)
+        before[:, 0] = -1
+        held = self._held(values, before[:, frames], (time - before)[:, frames])
+        return normal(*held, seen[:, frames])
 
     def _held(
         self, values: Tensor, last: Int[Tensor, "window time channel"], lead: Tensor

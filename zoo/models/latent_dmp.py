@@ -213,6 +213,25 @@ class LatentDmp(nn.Module):
         states = response.product(begin.flatten(1), force.flatten(1))
         return states[0].view(steps, len(batch), -1).transpose(0, 1)
 
+    def paths(
+        self,
+        z: Float[Tensor, "*sample window time latent"],
+        velocity: Float[Tensor, "*sample window latent"],
+        plan: Plan,
+        ε: Float[Tensor, "*sample window step latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "*sample window time latent"]:
+        """The paths of every draw of the program's sites, such as Pyro's vectorised particles."""
+        lead = z.shape[:-3]
+        if not lead:
+            return self.path(z[:, 0], velocity, plan, ε, batch)
+        parts = zip(
+            z.flatten(0, -4), velocity.flatten(0, -3), plan.draws(), ε.flatten(0, -4), strict=True
+        )
+        found = [self.path(z[:, 0], v, p, ε, batch) for z, v, p, ε in parts]
+        paths: Tensor = torch.stack(found).unflatten(0, lead)
+        return paths
+
     def kernels_at(self, steps: int, duration: float = 1.0) -> Float[Tensor, "step kernel"]:
         """Ψ of the first ``steps`` steps of a movement ``duration`` times as long, in float64."""
         time = torch.arange(steps, dtype=torch.float64)

@@ -144,7 +144,7 @@ class MeanRegressor(_Moments):
         with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
             likelihood = dist.Normal(self.mean, self.deviation).expand(batch.values.shape)
             site = likelihood.mask(seen_entries(batch)).to_event(1)
-            y: Tensor = pyro.sample("y", site, obs=batch.values)
+            y: Tensor = pyro.sample("y", site, obs=batch.given(batch.values))
         return y
 
     def regress(self, inputs: Float[Tensor, "item feature"], *, draws: int) -> Predictive:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float, Int
+from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
@@ -19,7 +19,14 @@ from zoo.dynamics.analogues import (
     interpolated,
     mean_square,
 )
-from zoo.models.baseline import check_fitted, moments, movements_of, observe, seen_entries
+from zoo.models.baseline import (
+    check_fitted,
+    moments,
+    movements_of,
+    normal,
+    observe_in_turn,
+    seen_entries,
+)
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
@@ -114,15 +121,20 @@ class NearestNeighbour(nn.Module):
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every frame after the first from the frames before it."""
         check_fitted("nearest-neighbour", self.noise)
-        x, seen, nobody = batch.values, seen_entries(batch), self._nobody(len(batch))
+        return observe_in_turn(batch, self._step)
+
+    def _step(self, x: Tensor, seen: Tensor, frames: range) -> TorchDistribution:
+        """``frames`` given the frames before them."""
         mean, deviation, _ = moments(self.memory.flatten(0, 1), self.seen.flatten(0, 1), 0)
-        location, variance = [mean.expand_as(x[:, 0])], [deviation.square().expand_as(x[:, 0])]
-        for t in range(1, x.shape[1]):
-            step = self._continued(x[:, :t], seen[:, :t], self._ahead(x, 1), nobody)[:, :, 0]
-            location.append(step.mean(0))
-            variance.append(step.var(0, unbiased=False) + self.noise[0].square())
-        scale = torch.stack(variance, 1).sqrt().clamp(min=self.config.noise_floor)
-        return observe(batch, dist.Normal(torch.stack(location, 1), scale))
+        first = mean.expand_as(x[:, 0]), deviation.square().expand_as(x[:, 0])
+        steps = [first if t == 0 else self._next(x[:, :t], seen[:, :t]) for t in frames]
+        location, variance = (torch.stack(each, 1) for each in zip(*steps, strict=True))
+        deviation = variance.sqrt().clamp(min=self.config.noise_floor)
+        return normal(location, deviation, seen[:, frames])
+
+    def _next(self, x: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        step = self._continued(x, seen, self._ahead(x, 1), self._nobody(len(x)))[:, :, 0]
+        return step.mean(0), step.var(0, unbiased=False) + self.noise[0].square()
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int

@@ -97,7 +97,7 @@ class VAE(nn.Module):
             z = pyro.sample("z", prior.expand(shape).mask(kept).to_event(2))
             mean, std = self.decoder(z)
             likelihood = dist.Normal(mean, std).mask(mask).to_event(2)
-            x: Tensor = pyro.sample("x", likelihood, obs=batch.values)
+            x: Tensor = pyro.sample("x", likelihood, obs=batch.given(batch.values))
         return x
 
     def explained(self, batch: Batch) -> tuple[int, Bool[Tensor, "window time"] | None]:

@@ -74,7 +74,7 @@ class VaeDmp(LatentDmp):
             z = pyro.sample("z", unit.expand([windows, time, latent]).to_event(2))
             velocity = pyro.sample("velocity", unit.expand([windows, latent]).to_event(1))
             ε = pyro.sample("epsilon", unit.expand([windows, time - 1, latent]).to_event(2))
-            path = self.path(z[:, 0], velocity, plan, ε, batch)
+            path = self.paths(z, velocity, plan, ε, batch)
             if self.config.flatness:
                 pyro.factor("flatness", self.flatness_prior(path))
             mean = self.decoder(torch.stack([path, self.embed(z)]))
@@ -82,7 +82,7 @@ class VaeDmp(LatentDmp):
                 x = dist.Normal(frames, self.output_std, validate_args=False)
                 if batch.mask is not None:
                     x = x.mask(batch.mask)
-                pyro.sample(name, x.to_event(2), obs=batch.values)
+                pyro.sample(name, x.to_event(2), obs=batch.given(batch.values))
 
     def plan(self, rows: int) -> Plan:
         """The sites of ``rows`` movements."""

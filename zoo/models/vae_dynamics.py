@@ -100,7 +100,7 @@ class VAEDynamics(nn.Module):
             z = pyro.sample("z", prior.expand(shape).mask(kept).to_event(2))
             mean, std = self.decoder(self.step(z, actions))
             likelihood = dist.Normal(mean, std).mask(mask).to_event(2)
-            x: Tensor = pyro.sample("x", likelihood, obs=batch.values[:, 1:])
+            x: Tensor = pyro.sample("x", likelihood, obs=batch.given(batch.values[:, 1:]))
         return x
 
     def explained(self, batch: Batch) -> tuple[int, Bool[Tensor, "window time"] | None]:
