@@ -9,7 +9,15 @@ from zoo.strategies import Exact, MarginalLikelihood, Svi
 
 __all__ = ["CATALOGUE", "list_models"]
 
-_AE_DMP = Svi(window=None, epochs=3000, learning_rate=1e-2, clip=100.0, max_steps=10_000)
+_KEPT_OUT = 0.25
+_AE_DMP = Svi(
+    window=None,
+    epochs=3000,
+    learning_rate=1e-2,
+    clip=100.0,
+    max_steps=10_000,
+    kept_out=_KEPT_OUT,
+)
 _VAE_DMP = Svi(
     window=10,
     epochs=1500,
@@ -18,6 +26,7 @@ _VAE_DMP = Svi(
     clip=100.0,
     temper_epochs=100,
     max_steps=30_000,
+    kept_out=_KEPT_OUT,
 )
 
 CATALOGUE = Registry(
@@ -181,7 +190,9 @@ CATALOGUE = Registry(
             thesis="§6.2.1, (85)",
             model="zoo.models.dvbf:Dvbf",
             guide="zoo.guides.sequential:SequentialGuide",
-            inference=replace(_VAE_DMP, window=20, epochs=300, learning_rate=1e-3, clip=10.0),
+            inference=replace(
+                _VAE_DMP, window=20, epochs=300, learning_rate=1e-3, clip=10.0, kept_out=0.0
+            ),
             data="sequences",
             dataset="robot-arm/reaching",
         ),

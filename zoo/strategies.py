@@ -29,7 +29,9 @@ class Svi:
     ``temper_epochs`` is T_a of (87), 0 for none; ``warmup_epochs`` a second schedule on the KL:
     both end before the last epoch, so that c = β = 1 is reached;
     ``patience`` validations without progress end the training and the best state is restored.
-    ``max_steps`` bounds the work on large data: see :meth:`budgeted`.
+    ``max_steps`` bounds the work on large data: see :meth:`budgeted`. ``kept_out`` is the share of
+    the movements' groups that the networks are not trained on where there is no validation part
+    and there are at least 10 groups: a model that learns its noise from new movements needs them.
     """
 
     epochs: int = 500
@@ -45,6 +47,7 @@ class Svi:
     validate_every: int = 10
     checkpoint_every: int = 10
     max_steps: int | None = None
+    kept_out: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse settings that no training could run with."""
@@ -56,6 +59,8 @@ class Svi:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive; got {value}")
+        if not 0 <= self.kept_out < 1:
+            raise ValueError(f"kept_out must be at least 0 and below 1; got {self.kept_out}")
         for name, symbol in _RAMPS.items():
             if getattr(self, name) >= self.epochs:
                 raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,18 +143,26 @@ def test_conditioned_cycles_are_those_of_the_dense_gaussians(own_noise: bool) ->
         assert (error / (size[:, None] * size)).abs().max() < 6 * math.sqrt(3 / draws)
 
 
+def shaped(u: Tensor) -> CyclePrior:
+    """The prior with the shape that was found for movements of parameters ``u``."""
+    torch.manual_seed(2)
+    designs, r = torch.randn(1, 12, 3), 0.02 * torch.randn(len(u), 12, 1)
+    prior = CyclePrior(designs, u, r, 1e-4 * torch.eye(1))
+    readout = Readout(torch.ones(len(u), 12, 1, 1), torch.tensor([0.01]))
+
+    def without(i: int) -> CyclePrior:
+        kept = torch.arange(len(u)) != i
+        return replace(prior, parameters=u[kept], residuals=r[kept])
+
+    return prior.tuned(designs[0] @ u + r, (1, 2), readout, without)
+
+
 def test_shape_of_the_mixture_is_that_of_its_movements() -> None:
-    """Movements that are all alike get a narrow mixture, movements all over a wide one."""
-    found = []
-    for spread in (0.02, 1.0):
-        torch.manual_seed(2)
-        designs = torch.randn(1, 12, 3)
-        u = torch.ones(9, 3, 1) + spread * torch.randn(9, 3, 1)
-        r = 0.02 * torch.randn(9, 12, 1)
-        prior = CyclePrior(designs, u, r, 1e-4 * torch.eye(1))
-        readout = Readout(torch.ones(9, 12, 1, 1), torch.tensor([0.01]))
-        found.append(prior.tuned(designs[0] @ u + r, (2, 4), readout).bandwidth)
-    assert found[0] <= found[1]
+    """Movements of three sorts get a narrow kernel each, those of one sort the Gaussian of all."""
+    torch.manual_seed(2)
+    sorts = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]).repeat(4, 1)[..., None]
+    assert shaped(sorts + 0.02 * torch.randn(12, 3, 1)).bandwidth <= 0.3
+    assert shaped(1 + 0.5 * torch.randn(12, 3, 1)).bandwidth >= 0.6
 
 
 def data_of(frames: int = FRAMES) -> Sequences:
@@ -247,3 +256,29 @@ def test_settings_of_discrete_movements_are_refused() -> None:
         Config(goal_scaling=True)
     with pytest.raises(ValueError, match="period must be positive; got 0"):
         Config(period=0.0)
+
+
+def test_a_movement_left_out_says_nothing_in_its_own_left_out_prior() -> None:
+    """Replaced by noise, it changes the prior of all, but no number of the prior of the others."""
+    data = data_of()
+    model, guide = build(data)
+    priors = []
+    shape = {"bandwidth": 0.6, "shrinkage": 0.3, "process": 1.0}
+    for values in (data.values, noise_for(data.values, row=2)):
+        torch.manual_seed(4)
+        with torch.no_grad():
+            model.learn_prior(whole(replace(data, values=values)), GuidePosterior(guide))
+        both = model.prior_without(2), model._prior(FRAMES, (16, 5))
+        priors.append([replace(prior, **shape) for prior in both])
+    (without, every), (other, noisy) = priors
+    for name in ("designs", "means", "root", "residuals", "observation"):
+        torch.testing.assert_close(getattr(without, name), getattr(other, name), msg=name)
+        if name != "designs":
+            assert not torch.allclose(getattr(every, name).mean(0), getattr(noisy, name).mean(0))
+
+
+def noise_for(values: Tensor, row: int) -> Tensor:
+    """The movements, one of them replaced by noise."""
+    changed = values.clone()
+    changed[row] = torch.randn(changed[row].shape, generator=torch.Generator().manual_seed(0))
+    return changed

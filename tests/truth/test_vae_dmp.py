@@ -446,3 +446,50 @@ def test_goal_scaling_keeps_the_shape_of_the_path():
             shapes.append((path - aimed.position.unsqueeze(2)) / span)
     for other in shapes[1:]:
         torch.testing.assert_close(other, shapes[0])
+
+
+def test_a_movement_left_out_says_nothing_in_its_own_left_out_prior():
+    """Replaced by noise, it changes the prior of all, but no number of the prior of the others."""
+    torch.manual_seed(8)
+    data = movements(5)
+    model, guide = build(data)
+    noisy = data.values.clone()
+    noisy[1] = torch.randn(FRAMES, CHANNELS)
+    priors = []
+    for values in (data.values, noisy):
+        torch.manual_seed(9)
+        with torch.no_grad():
+            model.learn_prior(whole(replace(data, values=values)), GuidePosterior(guide))
+        shape = {"bandwidth": 0.6, "shrinkage": 0.3, "process": 1.0}
+        priors.append([replace(p, **shape) for p in (model.prior_without(1), model._prior(FRAMES))])
+    (without, every), (other, changed) = priors
+    for name in ("means", "covariance", "observation"):
+        torch.testing.assert_close(getattr(without, name), getattr(other, name), msg=name)
+        assert not torch.allclose(getattr(every, name)[:1], getattr(changed, name)[:1])
+
+
+def test_noise_of_movements_kept_out_is_the_bound_s_best():
+    """No other σ gives the frames of (80) a higher expected density; training's is the least."""
+    torch.manual_seed(10)
+    data = movements(6)
+    model, guide = build(data)
+    batch, posterior = whole(data), GuidePosterior(guide)
+    with torch.no_grad():
+        before = model.output_std.clone()
+        model.learn_noise(batch, posterior)
+        z = posterior.encode(batch.values).sample((4000,))
+        x = model.decoder(model.embed(z))
+
+        def density(std: Tensor) -> Tensor:
+            return dist.Normal(x, std).log_prob(batch.values).mean((0, 1, 2))
+
+        best = density(model.output_std)
+        raised = model.output_std > before
+        assert bool(raised.any())
+        for factor in (0.8, 1.25):
+            other = density(factor * model.output_std)
+            assert bool((other < best)[raised].all())
+        quiet = replace(batch, values=x.mean(0))
+        after = model.output_std.clone()
+        model.learn_noise(quiet, posterior)
+        assert bool((model.output_std >= after).all())

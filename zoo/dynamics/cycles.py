@@ -11,7 +11,7 @@ stationary covariance of what such cycles leave of the movements known.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -118,18 +118,22 @@ class CyclePrior:
         paths: Float[Tensor, "movement time latent"],
         seen: Sequence[int],
         readout: Readout,
+        without: Callable[[int], CyclePrior],
     ) -> Self:
-        """The h, λ and ν under which the futures of movements left out are foretold best.
+        """The h, λ and ν under which the futures of movements left out are forecast best.
 
-        ``readout`` judges draws frame by frame and channel by channel; the three are chosen in
-        turn. Fewer than three movements leave too little to compare: the defaults stay.
+        ``without`` gives the prior of all movements but one; ``readout`` judges draws frame by
+        frame and channel by channel; the three are chosen in turn. Fewer than three movements
+        leave too little to compare: the defaults stay.
         """
         if len(paths) < 3:
             return self
-        best, known = self, dict[tuple[float, int], Glimpse]()
+        rows = torch.linspace(0, len(paths) - 1, min(len(paths), LEFT_OUT)).round().long()
+        others = {i: without(i) for i in rows.tolist()}
+        best, known = self, dict[tuple[int, float, int], Glimpse]()
         for name in (*CHOICES, "bandwidth"):
             options = [best._with(name, value) for value in CHOICES[name]]
-            best = max(options, key=lambda p: p.left_out(paths, seen, readout, known))
+            best = max(options, key=lambda p: p.left_out(paths, seen, readout, others, known))
         return best
 
     def left_out(
@@ -137,22 +141,23 @@ class CyclePrior:
         paths: Float[Tensor, "movement time latent"],
         seen: Sequence[int],
         readout: Readout,
-        known: dict[tuple[float, int], Glimpse],
+        others: Mapping[int, CyclePrior],
+        known: dict[tuple[int, float, int], Glimpse],
     ) -> float:
-        """Mean log density of movements' futures under the others (of a few movements).
+        """Mean log density of movements' futures under the others, of the same h, λ and ν.
 
-        ``known`` keeps what only depends on ν and the frames seen.
+        ``known`` keeps what only depends on the movement, ν and the frames seen.
         """
-        count, time = paths.shape[:2]
-        total, rows = 0.0, torch.linspace(0, count - 1, min(count, LEFT_OUT)).round().long()
-        for k in seen:
-            if (self.process, k) not in known:
-                known[self.process, k] = self.glimpse(torch.arange(time) < k)
-            for i in rows.tolist():
-                others = replace(self, parameters=self.parameters[torch.arange(count) != i])
-                drawn = others.given(known[self.process, k], paths[i][None]).sample(DRAWS)[:, 0]
+        h, λ, ν = self.shape
+        total = 0.0
+        for i, rest in others.items():
+            prior = replace(rest, bandwidth=h, shrinkage=λ, process=ν)
+            for k in seen:
+                if (i, ν, k) not in known:
+                    known[i, ν, k] = prior.glimpse(torch.arange(paths.shape[1]) < k)
+                drawn = prior.given(known[i, ν, k], paths[i][None]).sample(DRAWS)[:, 0]
                 total += float(readout.of(i).density_of_draws(drawn - paths[i])[k:].mean())
-        return total / (len(rows) * len(seen))
+        return total / (len(others) * len(seen))
 
     def _with(self, name: str, value: float) -> Self:
         change: dict[str, Any] = {name: value}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -109,37 +109,40 @@ class PathPrior:
             known=half,
         )
 
-    def tuned(self, seen: Sequence[int], readout: Readout) -> Self:
+    def tuned(
+        self, seen: Sequence[int], readout: Readout, without: Callable[[int], PathPrior]
+    ) -> Self:
         """The h, λ and ν with the best density of each movement's future, left out.
 
-        The future is every frame after the first ``seen`` ones, judged frame by frame and channel
-        by channel; the three are chosen in turn. Fewer than three movements leave too little to
-        compare: the defaults stay.
+        ``without`` gives the prior of all movements but one. The future is every frame after the
+        first ``seen`` ones, judged frame by frame and channel by channel; the three are chosen in
+        turn. Fewer than three movements leave too little to compare: the defaults stay.
         """
         if len(self.paths) < 3:
             return self
-        best = self
+        rows = torch.linspace(0, len(self.paths) - 1, min(len(self.paths), LEFT_OUT)).round()
+        best, others = self, {i: without(i) for i in rows.long().tolist()}
         for name in (*CHOICES, "bandwidth"):
             options = [best._with(name, value) for value in CHOICES[name]]
-            best = max(options, key=lambda prior: prior.left_out(seen, readout))
+            best = max(options, key=lambda prior: prior.left_out(seen, readout, others))
         return best
 
     def _with(self, name: str, value: float) -> Self:
         change: dict[str, Any] = {name: value}
         return replace(self, **change)
 
-    def left_out(self, seen: Sequence[int], readout: Readout) -> float:
-        """Mean log density of movements' futures under the others (of a few movements)."""
-        count, time = self.paths.shape[:2]
-        rows = torch.linspace(0, count - 1, min(count, LEFT_OUT)).round().long()
+    def left_out(
+        self, seen: Sequence[int], readout: Readout, others: Mapping[int, PathPrior]
+    ) -> float:
+        """Mean log density of movements' futures under the others, of the same h, λ and ν."""
+        h, λ, ν = self.shape
         total = 0.0
-        for i in rows.tolist():
-            kept = torch.arange(count) != i
-            others = replace(self, paths=self.paths[kept], residuals=self.residuals[kept])
+        for i, rest in others.items():
+            prior = replace(rest, bandwidth=h, shrinkage=λ, process=ν)
             for k in seen:
-                given = others.condition(self.paths[i], torch.arange(time) < k)
+                given = prior.condition(self.paths[i], torch.arange(self.paths.shape[1]) < k)
                 total += float(given.log_density(self.paths[i], readout.of(i))[k:].mean())
-        return total / (len(rows) * len(seen))
+        return total / (len(others) * len(seen))
 
 
 @dataclass(frozen=True)
@@ -173,11 +176,11 @@ class Conditioned:
     means: Float[Tensor, "*batch component time latent"]
     log_weights: Float[Tensor, "*batch component"]
     prior: Float[Tensor, "path path"]
-    known: Float[Tensor, "*batch seen path"]
+    known: Float[Tensor, "*#batch seen path"]
 
     @property
-    def covariance(self) -> Float[Tensor, "*batch path path"]:
-        """Covariance of whole paths."""
+    def covariance(self) -> Float[Tensor, "*#batch path path"]:
+        """Covariance of whole paths, one for all sequences unless each has noise of its own."""
         covariance: Tensor = self.prior - self.known.mT @ self.known
         return covariance
 

@@ -20,12 +20,15 @@ from zoo.types import Batch, Posterior
 
 __all__ = [
     "Conditions",
+    "LearnsNoise",
     "LearnsPrior",
     "MaximisesEvidence",
     "Prepares",
     "Session",
     "train_model",
 ]
+
+ENOUGH = 10
 
 
 @runtime_checkable
@@ -64,6 +67,15 @@ class LearnsPrior(Protocol):
         ...
 
 
+@runtime_checkable
+class LearnsNoise(Protocol):
+    """Noise that is estimated again on movements that no network was trained on."""
+
+    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
+        """Set the standard deviations of the observations."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Session:
     """How a training is run: seed, device, where its checkpoints are, and what it shows.
@@ -86,16 +98,48 @@ def train_model(
     val: Sequences | Pairs | None,
     session: Session,
 ) -> list[dict[str, Any]]:
-    """Train ``model`` and ``guide`` in place on scaled data; returns the history's rows."""
-    history = _TRAINERS[type(strategy)](model, guide, strategy, train, val, session)
+    """Train ``model`` and ``guide`` in place on scaled data; returns the history's rows.
+
+    Movements that the networks were not trained on, ``val`` or a share of ``train``, teach a model
+    that learns its noise so (:class:`LearnsNoise`) how far its frames are from new ones. A prior
+    over movements is then learned from all of ``train``.
+    """
+    known, held_out = _kept_out(model, strategy, train, val, session.seed)
+    history = _TRAINERS[type(strategy)](model, guide, strategy, known, val, session)
     model.eval()
     if guide is not None:
         guide.eval()
-    if guide is not None and isinstance(model, LearnsPrior):
         with seeded(session.seed, session.device), torch.no_grad():
-            model.learn_prior(whole(train), GuidePosterior(guide))
+            _learn(model, GuidePosterior(guide), train, held_out)
     _settle(model)
     return history
+
+
+def _learn(model: nn.Module, posterior: Posterior, train: Any, held_out: Any) -> None:
+    """What is estimated through the trained guide."""
+    if held_out is not None and isinstance(model, LearnsNoise):
+        model.learn_noise(whole(held_out), posterior)
+    if isinstance(model, LearnsPrior):
+        model.learn_prior(whole(train), posterior)
+
+
+def _kept_out(
+    model: nn.Module, strategy: Inference, train: Any, val: Any, seed: int
+) -> tuple[Any, Any]:
+    """The movements to train on and those that are kept out, if any."""
+    share = strategy.kept_out if isinstance(strategy, Svi) else 0.0
+    if share and not isinstance(model, LearnsNoise):
+        raise ValueError(
+            f"kept_out must be 0 for {type(model).__name__}, whose noise is not estimated again on "
+            f"movements kept out of the training; got {share:g}"
+        )
+    if val is not None or not share:
+        return train, val
+    columns = [n for n, v in train.groups.items() if n != "start" and len(set(v)) >= ENOUGH]
+    if not columns:
+        return train, None
+    known, held_out = train.split(by=columns[0], parts=(1 - share, share), seed=seed)
+    return known, held_out
 
 
 def _settle(model: nn.Module) -> None:

@@ -86,7 +86,8 @@ class AeDmp(nn.Module):
     movement representation by embedding dynamic movement primitives in deep autoencoders*,
     Humanoids 2015. Defaults: layers 50–36–20–5 and back, tanh (the thesis leaves it open),
     20 kernels, λ = 1e-3, data in [−1, 1]. Latent path and networks are points: bands of
-    reconstructions and new movements hold the one σ of all channels alone, which is learned.
+    reconstructions and new movements hold the one σ of all channels alone, which is learned, and
+    estimated again on movements that the networks were not trained on, where there are any.
     Forecasts and missing sections condition a mixture around the latent paths of the training
     movements on the frames seen (:class:`~zoo.dynamics.paths.PathPrior`), with draws; after
     training on a single movement it is as wide as that movement's own θ. Missing joints come from
@@ -228,24 +229,38 @@ class AeDmp(nn.Module):
         self.prior_residuals = (y - rolled) * seen[..., None]
         self.prior_shape = y.new_empty(0)
         prior, window = self._prior(self.frames), (self.frames // 7, self.frames // 2)
-        self.prior_shape = y.new_tensor(prior.tuned(window, self._readout(y)).shape)
+        tuned = prior.tuned(window, self._readout(y), self.prior_without)
+        self.prior_shape = y.new_tensor(tuned.shape)
+
+    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
+        """σ of movements that no network was trained on, never below what training found."""
+        y, _ = self._encoded(batch, posterior)
+        error = (self.decoder(y) - batch.values).square()
+        mean = error.mean() if batch.mask is None else (error * batch.mask).sum() / batch.mask.sum()
+        std = torch.maximum(mean.sqrt(), self.σ)
+        self.root.copy_((std - self.config.noise_floor).sqrt())
+
+    def prior_without(self, row: int) -> PathPrior:
+        """The mixture over latent paths of all training movements but one."""
+        return self._prior(self.frames, torch.arange(len(self.prior_movements)) != row)
 
     def _readout(self, y: Float[Tensor, "sequence time latent"]) -> Readout:
         J = jacobians(self.decoder, y.flatten(0, 1)).detach().double()
         std = self.σ.detach().double().expand(J.shape[1])
         return Readout(J.unflatten(0, y.shape[:2]), std)
 
-    def _prior(self, length: int) -> PathPrior:
-        """The mixture over latent paths of ``length`` frames, in float64."""
+    def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
+        """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
         if not self.prior_movements.numel():
             raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
-        θ = self.prior_movements.double()
+        kept = slice(None) if rows is None else rows
+        θ, residuals = self.prior_movements[kept].double(), self.prior_residuals[kept].double()
         size = θ.var(0) if len(θ) > 1 else θ.square().mean((0, 1)).expand_as(θ[0])
         return PathPrior.of_responses(
             self.imitator.design(length).to(θ.device),
             θ,
             size,
-            pad(self.prior_residuals.double(), (0, 0, 0, length - self.frames)),
+            pad(residuals, (0, 0, 0, length - self.frames)),
             FLOOR**2 * torch.eye(self.latent_dim, dtype=torch.float64, device=θ.device),
             self.prior_shape.tolist(),
         )

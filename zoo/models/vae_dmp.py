@@ -20,7 +20,7 @@ from zoo.models.latent_dmp import Config, LatentDmp, check_end, check_whole
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
-__all__ = ["Config", "Latents", "VaeDmp"]
+__all__ = ["Config", "Latents", "VaeDmp", "observed_mean"]
 
 _LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape")
 PRIOR_DRAWS = 32
@@ -46,7 +46,9 @@ class VaeDmp(LatentDmp):
     Forecasts and imputation know neither w nor goal of a new movement: after training the latents
     of the training movements become a mixture over latent paths, which is conditioned exactly on
     the frames seen (:class:`~zoo.dynamics.paths.PathPrior`). A frame seen in part is a Gaussian at
-    the mode of p(z | x_seen), which the decoder gives. Movements must have one common length.
+    the mode of p(z | x_seen), which the decoder gives. σ is estimated again on movements that the
+    networks were not trained on, where there are any (:meth:`learn_noise`). Movements must have one
+    common length.
     N. Chen, M. Karl, P. van der Smagt, *Dynamic movement primitives in latent space of
     time-dependent variational autoencoders*, Humanoids 2016.
     """
@@ -159,16 +161,33 @@ class VaeDmp(LatentDmp):
         rolled = self._prior(self.frames).paths.to(frames)
         self.prior_residuals = ((frames - rolled) * seen[..., None]).detach()
         tuned = self._prior(self.frames).tuned(
-            (self.frames // 7, self.frames // 2), self._readout(frames)
+            (self.frames // 7, self.frames // 2), self._readout(frames), self.prior_without
         )
         self.prior_shape = frames.new_tensor(tuned.shape)
+
+    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
+        """σ of movements that no network was trained on, never below what training found.
+
+        σ² = E_q (x − μ(g(z)))² is what maximises their bound (80); a decoder fits the frames that
+        it was trained on better than others.
+        """
+        z = posterior.encode(batch.values, batch.mask).sample((PRIOR_DRAWS,))
+        error = (self.decoder(self.embed(z)) - batch.values).square().mean(0)
+        found = observed_mean(error, batch.mask).sqrt()
+        std = torch.maximum(found, self.output_std)
+        self.output_root.copy_((std - self.config.output_floor).sqrt())
+
+    def prior_without(self, row: int) -> PathPrior:
+        """The mixture over latent paths of all training movements but one."""
+        return self._prior(self.frames, torch.arange(len(self.prior_movements)) != row)
 
     def _observe(self, batch: Batch, posterior: Posterior) -> Float[Tensor, "sequence time latent"]:
         """Encoded frames; how uncertain they are is kept."""
         q = posterior.encode(batch.values, batch.mask)
         frames, seen = self.embed(q.mean), self._frames_seen(batch)
-        noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames)[:, seen].flatten(0, 1)
-        self.prior_observation = (noise.T @ noise / len(noise)).detach()
+        noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames) * seen[..., None]
+        share = PRIOR_DRAWS * seen.sum() / len(frames)
+        self.prior_observation = (torch.einsum("smti,smtj->mij", noise, noise) / share).detach()
         return frames
 
     def _readout(self, frames: Float[Tensor, "sequence time latent"]) -> Readout:
@@ -227,11 +246,12 @@ class VaeDmp(LatentDmp):
         location = self.decoder(paths.to(self.output_root))
         return Predictive(location=location, noise=self.output_std, joint=True)
 
-    def _prior(self, length: int) -> PathPrior:
-        """The mixture over latent paths of ``length`` frames, in float64."""
+    def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
+        """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
         if not self.prior_movements.numel():
             raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
-        u, missing = self.prior_movements.double(), length - self.frames
+        movements, residuals, observation = self._known(rows)
+        u, missing = movements.double(), length - self.frames
         response = Response.of(self.system, length, torch.float64, u.device)
         force = self.system.stiffness * torch.cat(
             [self.config.w_scale * self.kernels_at(length - 1), torch.ones(length - 1, 1)], dim=1
@@ -243,9 +263,18 @@ class VaeDmp(LatentDmp):
             φ,
             u,
             _variances(u),
-            nn.functional.pad(self.prior_residuals.double(), (0, 0, 0, missing)),
-            self.prior_observation.double(),
+            nn.functional.pad(residuals.double(), (0, 0, 0, missing)),
+            observation.double().mean(0),
             self.prior_shape.tolist(),
+        )
+
+    def _known(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Latents, residuals and observation noise of all training movements or of some."""
+        kept = slice(None) if rows is None else rows
+        return (
+            self.prior_movements[kept],
+            self.prior_residuals[kept],
+            self.prior_observation[kept],
         )
 
     def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
@@ -309,6 +338,16 @@ def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row la
 def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
     """Whether only whole frames are missing, the same of every movement."""
     return bool((mask == mask[:1, :, :1]).all())
+
+
+def observed_mean(
+    error: Float[Tensor, "window time channel"], mask: Bool[Tensor, "window time channel"] | None
+) -> Float[Tensor, " channel"]:
+    """Mean of every channel over the entries observed."""
+    if mask is None:
+        return error.mean((0, 1))
+    mean: Tensor = (error * mask).sum((0, 1)) / mask.sum((0, 1)).clamp(min=1)
+    return mean
 
 
 def _need(posterior: Posterior | None) -> Posterior:

@@ -148,24 +148,30 @@ class RhythmicVaeDmp(VaeDmp):
         self.prior_shape = frames.new_empty(0)
         lengths = (self.frames // 7, self.frames // 3)
         prior, readout = self._prior(self.frames, COARSE), self._readout(frames)
-        tuned = prior.tuned(cycles + residuals, lengths, readout)
+        tuned = prior.tuned(cycles + residuals, lengths, readout, self.prior_without)
         self.prior_shape = frames.new_tensor(tuned.shape)
 
+    def prior_without(self, row: int) -> CyclePrior:  # type: ignore[override]
+        """The mixture over limit cycles of all training movements but one."""
+        return self._prior(self.frames, COARSE, torch.arange(len(self.prior_movements)) != row)
+
     def _prior(  # type: ignore[override]
-        self, length: int, grid: tuple[int, int] = GRID
+        self, length: int, grid: tuple[int, int] = GRID, rows: Tensor | None = None
     ) -> CyclePrior:
         """The mixture over limit cycles of ``length`` frames, phases and tempos, in float64."""
         if not self.prior_movements.numel():
             raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
-        middle, around = tempos(self.prior_timings[:, 1].double().neg().exp(), grid[1])
+        movements, residuals, observation = self._known(rows)
+        tempo = self.prior_timings[slice(None) if rows is None else rows, 1]
+        middle, around = tempos(tempo.double().neg().exp(), grid[1])
         λ = -(middle * around).log()
         φ = torch.arange(grid[0], dtype=torch.float64) * (2 * math.pi / grid[0])
         timings = torch.cartesian_prod(φ, λ)
         return CyclePrior(
             self._cycles(timings, length),
-            self.prior_movements.double(),
-            self.prior_residuals.double(),
-            self.prior_observation.double(),
+            movements.double(),
+            residuals.double(),
+            observation.double().mean(0),
             *self.prior_shape.tolist(),
         )
 
