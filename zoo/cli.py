@@ -270,7 +270,7 @@ def leaderboard(
     from zoo.leaderboard.own import asked_for
 
     if name is None and data is None:
-        listing = {k: p.summary for k, p in PROTOCOLS.items()}
+        listing = {k: f"{p.summary}; {p.protocol}" for k, p in PROTOCOLS.items()}
         print_json(listing) if json else Console().print(data_table(listing))
         return
     with _interruptible("repeat the command: what was found is kept under runs/leaderboard"):

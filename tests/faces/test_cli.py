@@ -66,6 +66,10 @@ def test_card_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "nowhere"], 1, "not a movezoo run"),
         (["experiment", "E9.9"], 2, "E6.1"),
         (["list", "--can", "fly"], 2, "forecast"),
+        (["leaderboard", "walk-setup-3"], 2, "walk-setup-1-published"),
+        (["leaderboard", "arm-goals", "--folds", "2"], 2, "folds must be between 3"),
+        (["leaderboard", "arm-goals", "--seen", "5"], 2, "need --data"),
+        (["leaderboard", "--data", "robot-arm", "--seen", "5", "--horizon", "99"], 2, "trial"),
         (["nonsense"], 2, "nonsense"),
     ],
 )
@@ -81,6 +85,26 @@ def test_mistakes_are_one_line_with_a_code(
     assert main(words) == code
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
+
+
+def test_a_leaderboard_on_own_movements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By name, question and group column; the command is kept; protocols say which they are."""
+    monkeypatch.chdir(tmp_path)
+    question = "--data robot-arm/reaching --seen 10 --horizon 8 --by operator"
+    words = ["leaderboard", *question.split(), "--models", "mean", "--folds", "3", "--json"]
+    assert main(words) == 0
+    stored = json.loads(Path("results/leaderboard_robot-arm-reaching-10-8.json").read_text())
+    assert stored["command"] == f"zoo leaderboard {question} --models mean --folds 3"
+    assert stored["source"] == "own" and len(stored["details"]["groups"]) == 12
+    cube = np.array(stored["details"]["coverage_90"]["mean"]["calibrated"])
+    assert cube.shape == (12, 6, 6)
+
+
+def test_protocols_say_which_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """Published ones that each movement is centred, the others that nothing hidden is used."""
+    assert main(["leaderboard", "--json"]) == 0
+    for name, summary in json.loads(capsys.readouterr().out).items():
+        assert ("published protocol: " in summary) == name.endswith("-published")
 
 
 def test_data_is_described(capsys: pytest.CaptureFixture[str]) -> None:

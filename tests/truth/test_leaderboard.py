@@ -221,7 +221,7 @@ def test_own_movements_make_a_board(tmp_path: Path) -> None:
 def test_what_own_movements_cannot_be_asked_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Too many frames, unknown or all channels, no such group, both questions at once."""
     data = movements()
-    with pytest.raises(ValueError, match=r"24 together, .*'tiny'; got 20 and 8"):
+    with pytest.raises(ValueError, match=r"at most 24, .*'tiny'; got 20 and 8"):
         own_protocol(data, seen=20, horizon=8)
     for hidden in (["knee"], ["joint"]):
         with pytest.raises(ValueError, match=f"some of the 7 channels .*; got {hidden[0]}"):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["draw"]
 
-KINDS = (("coverage_90", "C1", -0.16, "raw"), ("calibrated_coverage_90", "C2", 0.16, "calibrated"))
+KINDS = (("coverage_90", "C1", -0.16), ("calibrated_coverage_90", "C2", 0.16))
 
 
 def draw(board: Board) -> Figure:
@@ -61,9 +61,10 @@ def _errors(axes: Axes, board: Board) -> None:
 
 
 def _bands(axes: Axes, board: Board) -> None:
-    for name, colour, shift, label in KINDS:
-        shown = [(i, m) for i, m in enumerate(board.models) if name in board.models[m].scores]
-        for i, model in shown:
+    for name, colour, shift in KINDS:
+        for i, model in enumerate(board.models):
+            if name not in board.models[model].scores:
+                continue
             values = board.models[model].scores[name]
             place = np.full(len(values), i + shift)
             axes.scatter(values, place, s=7, color=colour, alpha=0.3, lw=0, zorder=1)
@@ -76,13 +77,10 @@ def _bands(axes: Axes, board: Board) -> None:
                 color=colour,
                 capsize=2,
                 zorder=2,
-                label=label if i == shown[0][0] else None,
             )
     axes.axvspan(87, 93, color="0.92", zorder=0)
     axes.axvline(90, color="0.6", lw=1, zorder=0)
     axes.set(
         xlabel="recorded values inside the 90 % band / %",
-        title="Coverage: groups pale, mean ± standard deviation",
+        title="Orange: raw, green: calibrated; groups pale, mean ± SD",
     )
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)

@@ -101,12 +101,16 @@ def _design(board: Board, found: Sequence[Found], groups: Sequence[object]) -> s
     parts = [{groups[row] for row in fold.calibration} for fold in folds]
     fewest, trained = min(map(len, parts)), min(len(fold.train) for fold in folds)
     seeds = len({f.cell.seed for f in found})
+    most = promised(LEVEL, fewest)
+    few = (
+        f" So few exchangeable groups can promise a new one at most {100 * most:.0f} %; what 90 % "
+        "bands hold is measured here."
+    )
     return (
         f"{len(set(groups))} groups ({board.protocol.by}) in {len(folds)} folds: models train on "
         f"at least {trained} movements, the bands' conformal correction is fitted on the next "
-        f"fold (at least {fewest} groups), the judged fold is in neither. As few exchangeable "
-        f"groups can promise a new one at most {100 * promised(LEVEL, fewest):.0f} %; what 90 % "
-        f"bands hold is measured here. {seeds} seed(s), averaged within a group. ± is Student's "
+        f"fold (at least {fewest} groups), the judged fold is in neither."
+        f"{few if most < LEVEL else ''} {seeds} seed(s), averaged within a group. ± is Student's "
         "95 % interval over groups, SD their standard deviation; p are Wilcoxon's signed-rank "
         "tests on the groups' MSE, adjusted after Holm. Groups share training movements, so that "
         "both are approximate."

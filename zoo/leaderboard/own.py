@@ -77,8 +77,9 @@ def _forecast(data: Sequences, seen: int, horizon: int) -> dict[str, Any]:
     shortest = int(data.lengths.min())
     if seen < 1 or horizon < 1 or seen + horizon > shortest:
         raise ValueError(
-            f"a forecast needs seen and horizon of at least 1 frame and {shortest} together, the "
-            f"length of the shortest movement of {data.name!r}; got {seen} and {horizon}"
+            "a forecast needs seen and horizon of at least 1 frame and together at most "
+            f"{shortest}, the length of the shortest movement of {data.name!r}; got {seen} and "
+            f"{horizon}"
         )
     return {
         "name": f"{_slug(data.name)}-{seen}-{horizon}",

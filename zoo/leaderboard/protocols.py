@@ -27,8 +27,6 @@ FORECASTERS = (
     "vae-dmp",
     "ae-dmp",
     "dvbf",
-    "sparse-ae-dmp",
-    "ae-then-dmp",
     "promp-rhythmic+vae-dmp-rhythmic",
 )
 IMPUTERS = (
@@ -47,7 +45,7 @@ IMPUTERS = (
     "nearest-neighbour+promp-rhythmic",
     "promp-rhythmic+vae-dmp-rhythmic",
 )
-_LEFT_OUT_OF_PUBLISHED = ("ae-dmp", "sparse-ae-dmp", "ae-then-dmp")
+_LEFT_OUT_OF_PUBLISHED = ("vae-dmp", "ae-dmp")
 _AE_DMP: Mapping[str, Any] = {"epochs": 1000}
 _WALK_SETTINGS: Settings = {
     "kernel-ridge": {"places": 200},
