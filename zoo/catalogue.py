@@ -259,7 +259,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="nearest-neighbour",
-            summary="The most similar training movements, continued",
+            summary="The most similar places of training movements, continued and entered again",
             thesis="baseline, not in the thesis",
             model="zoo.models.nearest_neighbour:NearestNeighbour",
             guide=None,

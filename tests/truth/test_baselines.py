@@ -138,69 +138,6 @@ def test_last_value_draws_of_a_random_walk_have_its_covariance() -> None:
     assert bool(((steps.T.cov() - expected).abs() < tolerance).all())
 
 
-def brute_force(
-    train: list[np.ndarray], query: np.ndarray, horizon: int, neighbours: int
-) -> list[np.ndarray]:
-    """Continuations of the nearest place of each of the nearest movements, by loops."""
-    context, best = len(query), []
-    for movement in train:
-        places = range(context, len(movement) - horizon + 1)
-        found = [(np.nanmean((movement[p - context : p] - query) ** 2), p) for p in places]
-        if found:
-            distance, place = min(found)
-            ahead = movement[place : place + horizon]
-            best.append((distance, ahead + query[-1] - movement[place - 1]))
-    return [b for _, b in sorted(best, key=lambda pair: pair[0])[:neighbours]]
-
-
-def test_nearest_neighbour_forecast_equals_brute_force() -> None:
-    data = simulate(movements=10)
-    model = fitted(NearestNeighbour, nearest_neighbour, data[:7], neighbours=3, context=4)
-    answer = model.forecast(whole(data[7:].first(12)), None, horizon=6, draws=1)
-    for i, query in enumerate(data[7:].first(12).arrays):
-        expected = brute_force(data[:7].arrays, query[-4:], 6, 3)
-        np.testing.assert_allclose(answer.location[:, i].numpy(), expected, atol=1e-10)
-
-
-def test_nearest_neighbour_spread_has_the_error_of_left_out_movements() -> None:
-    data = simulate(movements=8)
-    model = fitted(
-        NearestNeighbour, nearest_neighbour, data, neighbours=2, context=3, positions=100
-    )
-    error, spread = [], []
-    for i, movement in enumerate(data.arrays):
-        others = [a for j, a in enumerate(data.arrays) if j != i]
-        for place in range(3, len(movement) - 4):
-            ahead = len(movement) - place
-            if sum(len(o) - 3 >= ahead for o in others) < 2:
-                continue
-            near = np.array(brute_force(others, movement[place - 3 : place], ahead, 2))
-            error.append((movement[place + 4] - near.mean(0)[4]) ** 2)
-            spread.append(near.var(0)[4])
-    expected = np.maximum(np.mean(error, 0) - np.mean(spread, 0), np.mean(error, 0) / 4)
-    np.testing.assert_allclose(model.noise[4].square().numpy(), expected, rtol=0.1)
-
-
-def test_nearest_neighbour_finds_a_movement_that_it_knows() -> None:
-    data = simulate(movements=8)
-    model = fitted(NearestNeighbour, nearest_neighbour, data, neighbours=1)
-    future = model.forecast(whole(data[:1].first(12)), None, horizon=10, draws=1)
-    torch.testing.assert_close(future.location[0], data.values[:1, 12:22])
-    filled = model.impute(whole(with_holes(data[:3].first(20), 0.4)), None, draws=1)
-    torch.testing.assert_close(filled.location[0], data.values[:3, :20])
-
-
-def test_leaving_out_groups_widens_the_spread_of_a_group_that_repeats_itself() -> None:
-    rng = np.random.default_rng(0)
-    own = rng.normal(size=(4, 30, 2)).cumsum(1)
-    arrays = [own[i // 2] + 0.01 * rng.normal(size=(30, 2)) for i in range(8)]
-    groups = {"trial": range(8), "subject": [i // 2 for i in range(8)]}
-    data = Sequences.from_arrays(arrays, rate=30.0, groups=groups)
-    trial = fitted(NearestNeighbour, nearest_neighbour, data, neighbours=1)
-    subject = fitted(NearestNeighbour, nearest_neighbour, data, neighbours=1, leave_out="subject")
-    assert bool((subject.noise[:10] > 5 * trial.noise[:10]).all())
-
-
 def test_gaps_are_interpolated_as_numpy_does() -> None:
     data = with_holes(simulate(), 0.4)
     filled = interpolated(data.values, data.mask, torch.zeros(2).double())
@@ -258,9 +195,10 @@ def test_a_model_without_data_says_so(kind, home) -> None:  # type: ignore[no-un
 
 
 def test_too_little_data_is_named() -> None:
-    short = simulate(movements=1, frames=4)
-    with pytest.raises(ValueError, match="longer than its context of 5 frames; the longest has 4"):
-        fitted(NearestNeighbour, nearest_neighbour, short)
+    with pytest.raises(ValueError, match="at least 2 frames; the longest has 1"):
+        fitted(NearestNeighbour, nearest_neighbour, simulate().first(1))
+    with pytest.raises(ValueError, match="at least 41 frames; the longest has 40"):
+        fitted(NearestNeighbour, nearest_neighbour, simulate(), context=40)
     with pytest.raises(ValueError, match="at least 2 movements"):
         fitted(NearestNeighbour, nearest_neighbour, simulate(movements=1))
     with pytest.raises(ValueError, match="no group column 'day'; there are trial, subject"):
@@ -278,6 +216,7 @@ def test_too_little_data_is_named() -> None:
         (autoregression, {"shrinkage": 1.5}, "shrinkage must be between 0 and 1"),
         (nearest_neighbour, {"neighbours": 0}, "neighbours must be at least 1"),
         (nearest_neighbour, {"decay": 0.0}, "decay must be positive"),
+        (nearest_neighbour, {"align": "first"}, "align must be none, last, mean, fading or None"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(home, settings, message: str) -> None:  # type: ignore[no-untyped-def]

@@ -11,7 +11,6 @@ __all__ = [
     "carried",
     "error_sums",
     "interpolated",
-    "mean_square",
     "sums_of_squares",
 ]
 
@@ -63,12 +62,6 @@ def sums_of_squares(x: Tensor, m: Tensor, y: Tensor, n: Tensor) -> tuple[Tensor,
     """Squared difference of every row of x and of y over entries seen in both, and their number."""
     square = x.square() @ n.T + m @ y.square().T - 2 * x @ y.T
     return square.clamp(min=0), m @ n.T
-
-
-def mean_square(x: Tensor, m: Tensor, y: Tensor, n: Tensor) -> Tensor:
-    """Mean square of each candidate over the seen entries of its frames and channels."""
-    square, both = sums_of_squares(x, m, y, n)
-    return torch.where(both > 0, square / both.clamp(min=1), torch.finfo(x.dtype).max)
 
 
 def carried(

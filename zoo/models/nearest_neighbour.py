@@ -1,27 +1,26 @@
-"""The most similar training movements are continued: `nearest-neighbour`."""
+"""The most similar places of the training movements are continued: `nearest-neighbour`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.dynamics.analogues import (
-    alignment_cost,
-    carried,
-    error_sums,
-    interpolated,
-    mean_square,
-)
+from zoo.dynamics.analogue_selection import Choice, Options, Trials, forecast
+from zoo.dynamics.analogues import carried, error_sums, interpolated
+from zoo.dynamics.chain_selection import folds_of, places
+from zoo.dynamics.gaps import Gaps
+from zoo.dynamics.re_entry import ALIGNMENTS, Align, Library
 from zoo.models.baseline import (
     check_fitted,
     moments,
+    movement_groups,
     movements_of,
     normal,
     observe_in_turn,
@@ -32,23 +31,30 @@ from zoo.types import Batch, Layout, Posterior
 
 __all__ = ["Config", "NearestNeighbour"]
 
+CONTEXTS = (1, 3, 10, 30)
+NEIGHBOURS = (1, 2, 4, 8, 16)
+DECAYS = (2.0, 6.0, 20.0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """Settings of :class:`NearestNeighbour`.
+    """Settings of :class:`NearestNeighbour`; None is chosen by cross-validation.
 
-    ``neighbours`` movements are kept; forecasts compare the last ``context`` frames seen;
-    imputation weighs frames by exp(−distance/``decay``), in frames. With ``align`` each neighbour
-    is shifted to meet what was seen: the last frame, or the frames around a gap. ``leave_out`` is
-    the group column whose members are never neighbours of each other when the spread is fitted
-    (None: single movements), at ``positions`` places of every movement. ``noise_floor`` is in
-    scaled units.
+    The last ``context`` frames are compared, ``neighbours`` places are kept. ``align`` shifts what
+    they say to meet what was observed: ``none``, by the ``last`` frame, by the ``mean`` over the
+    context, or by the last frame, ``fading`` with the lead time; a gap is shifted or not.
+    ``re_enter`` goes on from the most similar place where a movement ends, else its last frame is
+    held. Imputation weighs frames by exp(−distance/``decay``), in frames. ``leave_out`` is the
+    group column that is kept whole by cross-validation (None: single movements), which forecasts
+    from ``positions`` places of every movement to fit the bands. ``noise_floor`` is in scaled
+    units.
     """
 
-    neighbours: int = 5
-    context: int = 5
-    align: bool = True
-    decay: float = 5.0
+    neighbours: int | None = None
+    context: int | None = None
+    align: Align | None = None
+    re_enter: bool | None = None
+    decay: float | None = None
     leave_out: str | None = None
     positions: int = 8
     noise_floor: float = 1e-4
@@ -56,34 +62,43 @@ class Config:
     def __post_init__(self) -> None:
         """Refuse settings without a meaning."""
         for name in ("neighbours", "context", "positions"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1; got {value}")
         for name in ("decay", "noise_floor"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive; got {value}")
+        if self.align is not None and self.align not in get_args(Align):
+            raise ValueError(f"align must be {', '.join(ALIGNMENTS)} or None; got {self.align!r}")
 
 
 class NearestNeighbour(nn.Module):
-    """What came next in the training movements that looked most alike is what comes next.
+    """What came next wherever the training movements looked most alike is what comes next.
 
-    x_{k+h} ~ 1/K Σ_{i=1}^K N(y_i(t_i + h) + x_k − y_i(t_i), s_h²)
+    x_{k+h} ~ 1/K Σ_{i=1}^K N(y_i(t_i + h) + e^{−h/τ} (x_k − y_i(t_i)), s_h²)
 
-    y_i(t_i) is the place of training movement i, over all its places, whose last frames are
-    nearest to the last frames seen (mean squared distance over the entries seen in both); the K
-    nearest movements are kept. Places with enough frames to come are preferred; a neighbour that
-    ends too early holds its last frame. The spread is that of the neighbours, and s_h, which
-    makes the mixture's variance that of the errors of the same forecasts of training movements
-    that were left out (and is at least half of their root mean square). Imputation compares
-    frame by frame, near frames counting most, and takes the missing entries from the nearest
-    places, shifted by what they lie below the frames seen; its s is fitted on left-out movements
-    with the same entries hidden. Fix & Hodges (1951); Lorenz, *Atmospheric predictability as
-    revealed by naturally occurring analogues*, J. Atmos. Sci. 26 (1969).
+    y_i(t_i) is a place of a training movement, any frame of it, whose last frames are nearest to
+    the last frames observed (mean squared distance over the entries observed in both, a local
+    minimum along the movement); the K nearest places are kept. Where a movement ends, it goes on
+    from the place most like its end. K, the number of frames compared, the shift (none, kept, or
+    fading with τ) and whether a movement is entered again are those with the least squared error
+    of forecasts of held-out training movements, over at most four folds of whole movements. s_h
+    makes the mixture's variance that of the errors of the same forecasts (and is at least half of
+    their root mean square); it is fitted for fewer observed frames, too.
+
+    Imputation compares frame by frame, near frames counting most, and takes the missing entries
+    from the nearest places, shifted by what they lie below the frames observed if that helps: its
+    settings and its s are fitted when it is asked, on left-out training movements with the same
+    entries hidden. Fix & Hodges (1951); Lorenz, *Atmospheric predictability as revealed by
+    naturally occurring analogues*, J. Atmos. Sci. 26 (1969).
 
     Missing entries of the training movements are interpolated in time where a neighbour is
     continued; distances and errors leave them out. Noise is independent from frame to frame.
-    The generative program scores a movement one step at a time by the mixture's moments.
+    The generative program scores a movement one step at a time by the mixture's moments. It is a
+    baseline, not in the thesis, and it has no guide: there is no latent variable.
 
-    Defaults: 5 neighbours, 5 frames of context, aligned; data standardised.
+    Defaults: all chosen; data standardised.
     """
 
     config_class: ClassVar[type] = Config
@@ -93,6 +108,8 @@ class NearestNeighbour(nn.Module):
     lengths: Tensor
     group: Tensor
     noise: Tensor
+    contexts: Tensor
+    chosen: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """Placeholders until :meth:`condition`."""
@@ -100,23 +117,44 @@ class NearestNeighbour(nn.Module):
         self.layout, self.config = layout, config
         for name in ("memory", "noise"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
-        for name in ("lengths", "group"):
+        for name in ("lengths", "group", "contexts", "chosen"):
             self.register_buffer(name, torch.empty(0, dtype=torch.long))
         self.register_buffer("seen", torch.empty(0, dtype=torch.bool))
 
     def condition(self, data: Sequences | Pairs) -> None:
-        """Keep the movements and fit s_h on those left out."""
+        """Keep the movements, choose how to continue them, and fit s_h on those held out."""
         movements = movements_of("nearest-neighbour", data, self.dtype)
-        if int(movements.lengths.max()) <= self.config.context:
+        shortest, longest = 1 + (self.config.context or 1), int(movements.lengths.max())
+        if longest < shortest:
             raise ValueError(
-                f"nearest-neighbour needs movements longer than its context of "
-                f"{self.config.context} frames; the longest has {int(movements.lengths.max())}"
+                f"nearest-neighbour needs movements of at least {shortest} frames; "
+                f"the longest has {longest}"
             )
         self.seen, self.lengths = movements.mask, movements.lengths
         self.group = self._groups(movements)
         mean, _, _ = moments(movements.values.flatten(0, 1), self.seen.flatten(0, 1), 0)
         self.memory = interpolated(movements.values, self.seen, mean)
-        self.noise = self._forecast_noise()
+        trials = Trials(self.library, folds_of(self.group))
+        choice = trials.chosen(self._options())
+        kind = ALIGNMENTS.index(choice.align)
+        kept = [choice.context, choice.neighbours, kind, int(choice.re_enter)]
+        self.chosen = self.lengths.new_tensor(kept)
+        levels = [c for c in CONTEXTS if c < choice.context] + [choice.context]
+        self.contexts = self.lengths.new_tensor(levels)
+        self.noise = torch.stack([self._forecast_noise(trials, choice, c) for c in levels])
+
+    @property
+    def library(self) -> Library:
+        """The training movements."""
+        everybody = torch.ones_like(self.lengths, dtype=torch.bool)
+        return Library(self.memory, self.seen, self.lengths, everybody)
+
+    @property
+    def choice(self) -> Choice:
+        """How they are continued."""
+        check_fitted("nearest-neighbour", self.noise)
+        context, neighbours, align, again = self.chosen.tolist()
+        return Choice(context, neighbours, ALIGNMENTS[align], bool(again))
 
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every frame after the first from the frames before it."""
@@ -133,179 +171,114 @@ class NearestNeighbour(nn.Module):
         return normal(location, deviation, seen[:, frames])
 
     def _next(self, x: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        step = self._continued(x, seen, self._ahead(x, 1), self._nobody(len(x)))[:, :, 0]
-        return step.mean(0), step.var(0, unbiased=False) + self.noise[0].square()
+        step = forecast(self.library, x, seen, 1, self.choice)[:, :, 0]
+        noise = self._noise(x.shape[1], 1)[0]
+        return step.mean(0), step.var(0, unbiased=False) + noise.square()
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
         """The continuations of the nearest places, one component each."""
-        check_fitted("nearest-neighbour", self.noise)
-        seen, nobody = seen_entries(batch), self._nobody(len(batch))
-        location = self._continued(batch.values, seen, self._ahead(seen, horizon), nobody)
-        lead = torch.arange(horizon, device=location.device).clamp(max=len(self.noise) - 1)
-        return Predictive(location=location, noise=self.noise[lead], joint=True)
+        mask = seen_entries(batch)
+        location = forecast(self.library, batch.values, mask, horizon, self.choice)
+        noise = self._noise(batch.values.shape[1], horizon)
+        return Predictive(location=location, noise=noise, joint=True)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The frames of the nearest places, one component each."""
         check_fitted("nearest-neighbour", self.noise)
-        mask, nobody = seen_entries(batch), self._nobody(1)[0]
-        pairs = zip(batch.values, mask, strict=True)
-        location = torch.stack([self._filled(x, m, nobody) for x, m in pairs], 1)
+        mask = seen_entries(batch)
+        location, noise = [batch.values[:0]] * len(mask), torch.zeros_like(batch.values[:, :1])
         patterns, which = torch.unique(mask, dim=0, return_inverse=True)
-        count = max(2, 20 // len(patterns))
-        noise = torch.stack([self._imputation_noise(p, count) for p in patterns])
-        return Predictive(location=location, noise=noise[which][:, None], joint=True)
+        for p, pattern in enumerate(patterns):
+            gaps, neighbours, align, s = self._tuned(pattern, max(2, 20 // len(patterns)))
+            for i in (which == p).nonzero()[:, 0].tolist():
+                everybody = torch.ones_like(self.lengths, dtype=torch.bool)
+                filled = gaps.filled(batch.values[i], mask[i], everybody, neighbours)
+                location[i], noise[i] = filled[int(align)], s
+        most = max(map(len, location))
+        every = [part[torch.arange(most, device=mask.device) % len(part)] for part in location]
+        return Predictive(location=torch.stack(every, 1), noise=noise, joint=True)
 
     def _groups(self, data: Sequences) -> Int[Tensor, " movement"]:
         column = self.config.leave_out
         if column is not None and column not in data.groups:
             raise ValueError(f"no group column {column!r}; there are {', '.join(data.groups)}")
-        labels = list(range(len(data))) if column is None else list(data.groups[column])
+        labels = movement_groups(data).tolist() if column is None else list(data.groups[column])
         order = list(dict.fromkeys(labels))
         if len(order) < 2:
             raise ValueError(
                 "nearest-neighbour needs at least 2 "
-                f"{'movements' if column is None else column + ' groups'} to fit its spread; got 1"
+                f"{'movements' if column is None else column + ' groups'}, to choose its settings "
+                "and bands on those held out; got 1"
             )
-        numbers = [order.index(label) for label in labels]
-        return torch.tensor(numbers, device=data.lengths.device)
+        return self.lengths.new_tensor([order.index(label) for label in labels])
 
-    def _nobody(self, queries: int) -> Bool[Tensor, "query movement"]:
-        return torch.zeros(queries, len(self.memory), dtype=torch.bool, device=self.memory.device)
+    def _options(self) -> Options:
+        """What the settings leave open and the movements allow."""
+        config, half = self.config, int(self.lengths.max()) // 2
+        contexts = [c for c in CONTEXTS if c <= max(1, half)]
+        return Options(
+            contexts=contexts if config.context is None else [config.context],
+            neighbours=NEIGHBOURS if config.neighbours is None else [config.neighbours],
+            alignments=ALIGNMENTS if config.align is None else [config.align],
+            re_enter=(True, False) if config.re_enter is None else [config.re_enter],
+        )
 
-    def _ahead(self, queries: Tensor, horizon: int) -> Int[Tensor, " query"]:
-        return torch.full((len(queries),), horizon, device=queries.device)
+    def _forecast_noise(
+        self, trials: Trials, choice: Choice, known: int
+    ) -> Float[Tensor, "lead channel"]:
+        """s_h after ``known`` frames, as many leads for all; unknown ones as the last known."""
+        wrong, spread, count = trials.errors(choice, known, self.config.positions)
+        number = count.clamp(min=1)
+        s = carried(self._unexplained(wrong / number, spread / number), count > 0)
+        index = torch.arange(self.memory.shape[1] - 1, device=s.device).clamp(max=len(s) - 1)
+        longer: Tensor = s[index]
+        return longer
 
-    def _spread_out(self, first: int, last: int, count: int) -> Int[Tensor, " place"]:
-        even = torch.linspace(first, last, count, device=self.memory.device)
-        places: Tensor = even.long().unique()
-        return places
+    def _noise(self, known: int, horizon: int) -> Float[Tensor, "lead channel"]:
+        """s_h of a forecast from ``known`` frames."""
+        level = int((self.contexts <= known).sum().clamp(min=1)) - 1
+        lead = torch.arange(horizon, device=self.noise.device)
+        noise: Tensor = self.noise[level, lead.clamp(max=self.noise.shape[1] - 1)]
+        return noise
 
-    def _continued(
-        self,
-        values: Float[Tensor, "query frame channel"],
-        mask: Bool[Tensor, "query frame channel"],
-        ahead: Int[Tensor, " query"],
-        banned: Bool[Tensor, "query movement"],
-    ) -> Float[Tensor, "neighbour query time channel"]:
-        """The frames after the best place of each of the nearest movements, the longest ``ahead``.
+    def _tuned(
+        self, pattern: Bool[Tensor, "time channel"], movements: int
+    ) -> tuple[Gaps, int, bool, Float[Tensor, " channel"]]:
+        """Decay, neighbours, shift and s where left-out movements miss what ``pattern`` misses."""
+        config = self.config
+        decays = DECAYS if config.decay is None else (config.decay,)
+        sizes: Sequence[int] = NEIGHBOURS if config.neighbours is None else (config.neighbours,)
+        shifts = [False, True] if config.align is None else [config.align != "none"]
+        every = [Gaps(self.library, decay) for decay in decays]
+        sums = torch.stack([self._left_out(gaps, pattern, movements, sizes) for gaps in every])
+        gappy = ~pattern.all(0)
+        error = sums[..., 0, :][..., gappy].sum(-1)[:, [int(s) for s in shifts]]
+        d, a, n = (int(v) for v in torch.unravel_index(error.argmin(), error.shape))
+        wrong, spread, count = sums[d, int(shifts[a]), n]
+        s = self._unexplained(wrong / count.clamp(min=1), spread / count.clamp(min=1))
+        return every[d], sizes[n], shifts[a], s
 
-        Every query prefers places with the frames that it asks for.
-        """
-        context = min(self.config.context, values.shape[1])
-        x, m = values[:, -context:], mask[:, -context:]
-        movement, end = self._nearest(x, m, ahead, banned)
-        frame = end[..., None] + torch.arange(1, int(ahead.max()) + 1, device=end.device)
-        frame = torch.minimum(frame, self.lengths[movement][..., None] - 1)
-        future = self.memory[movement[..., None], frame]
-        if self.config.align:
-            shift = (x[:, -1] - self.memory[movement, end]) * m[:, -1]
-            future = future + shift[:, :, None]
-        return future
-
-    def _nearest(
-        self, x: Tensor, m: Tensor, ahead: Tensor, banned: Tensor
-    ) -> tuple[Int[Tensor, "neighbour query"], Int[Tensor, "neighbour query"]]:
-        """Movements, and in each the frame that matches the last frame of ``x``."""
-        context = x.shape[1]
-        distance = self._distances(x, m)
-        end = torch.arange(context - 1, self.memory.shape[1], device=x.device)
-        left = (self.lengths[:, None] - 1 - end).expand(len(x), -1, -1)
-        left = left.masked_fill(banned[..., None], -1)
-        neighbours = min(self.config.neighbours, int((left[..., 0] >= 0).sum(1).min()))
-        if neighbours < 1:
-            raise ValueError(
-                f"no training movement of {context} frames is left to compare with; "
-                f"the longest has {int(self.lengths.max())}"
-            )
-        enough = torch.minimum(left[..., 0].topk(neighbours, dim=1).values[:, -1], ahead)
-        distance = distance.masked_fill(left < enough[:, None, None], torch.inf)
-        best = distance.min(-1)
-        movement = best.values.topk(neighbours, dim=1, largest=False).indices
-        return movement.T, best.indices.gather(1, movement).T + context - 1
-
-    def _distances(self, x: Tensor, m: Tensor) -> Float[Tensor, "query movement place"]:
-        """Mean squared difference to every run of training frames, over entries seen in both."""
-        y = (self.memory * self.seen).unfold(1, x.shape[1], 1).mT.flatten(-2)
-        n = self.seen.to(y).unfold(1, x.shape[1], 1).mT.flatten(-2)
-        x, m = (x * m).flatten(1), m.to(y).flatten(1)
-        rows = mean_square(x, m, y.flatten(0, 1), n.flatten(0, 1))
-        places: Tensor = rows.unflatten(1, y.shape[:2])
-        return places
-
-    def _forecast_noise(self) -> Float[Tensor, "lead channel"]:
-        """s_h from forecasts of left-out movements, at evenly spaced places."""
-        context, frames = self.config.context, self.memory.shape[1]
-        error = self.memory.new_zeros(3, frames - context, self.memory.shape[2])
-        for i in torch.nonzero(self.lengths > context).flatten().tolist():
-            error += self._left_out(i)
-        count = error[2]
-        wrong, spread = error[:2] / count.clamp(min=1)
-        return carried(self._unexplained(wrong, spread), count > 0)
-
-    def _left_out(self, i: int) -> Float[Tensor, "3 lead channel"]:
-        """Sums of squared error, of the neighbours' variance, and their count, by lead."""
-        context, length = self.config.context, int(self.lengths[i])
-        place = self._spread_out(context, length - 1, self.config.positions)
-        back = place[:, None] + torch.arange(-context, 0, device=place.device)
-        lead = place[:, None] + torch.arange(length - context, device=place.device)
-        inside = lead.clamp(max=length - 1)
-        banned = (self.group == self.group[i]).expand(len(place), -1)
-        near = self._continued(self.memory[i, back], self.seen[i, back], length - place, banned)
-        known = self.seen[i, inside] & (lead < length)[..., None]
-        sums = error_sums(self.memory[i, inside] - near.mean(0), near, known)
-        return pad(sums, (0, 0, 0, self.memory.shape[1] - length))
+    def _left_out(
+        self, gaps: Gaps, pattern: Tensor, movements: int, sizes: Sequence[int]
+    ) -> Float[Tensor, "shift size 3 channel"]:
+        last = len(self.memory) - 1
+        rows = places(0, last, min(movements, last + 1))
+        every: Tensor = torch.stack([self._filled(gaps, i, pattern, sizes) for i in rows]).sum(0)
+        return every
 
     def _filled(
-        self,
-        x: Float[Tensor, "time channel"],
-        m: Bool[Tensor, "time channel"],
-        banned: Bool[Tensor, " movement"],
-    ) -> Float[Tensor, "neighbour time channel"]:
-        """For every frame the frames that stand where the movement around it fits best."""
-        weight = self._weight(len(x))
-        cost = alignment_cost(x, m, self.memory, self.seen, self.lengths, weight)
-        cost = cost.masked_fill(banned[:, None], torch.inf)
-        best = cost.min(-1)
-        neighbours = min(self.config.neighbours, int((~banned).sum()))
-        movement = best.values.topk(neighbours, dim=1, largest=False).indices
-        time = torch.arange(len(x), device=x.device)[:, None]
-        lag = best.indices.gather(1, movement) - (len(x) - 1)
-        frames = self.memory[movement, lag + time]
-        if self.config.align:
-            frames = frames + self._shift(x, m, movement, lag)
-        return frames.transpose(0, 1)
-
-    def _shift(self, x: Tensor, m: Tensor, movement: Tensor, lag: Tensor) -> Tensor:
-        """What each place lies below the movement in the frames seen around it."""
-        partner = lag[..., None] + torch.arange(len(x), device=x.device)
-        ends = self.lengths[movement][..., None]
-        inside = ((partner >= 0) & (partner < ends))[..., None] & m
-        near = self.memory[movement[..., None], torch.minimum(partner.clamp(min=0), ends - 1)]
-        weight = self._weight(len(x))[:, None, :, None] * inside
-        below = (weight * (x - near)).sum(2)
-        return below / weight.sum(2).clamp(min=torch.finfo(x.dtype).tiny)
-
-    def _weight(self, frames: int) -> Float[Tensor, "time time"]:
-        time = torch.arange(frames, device=self.memory.device)
-        return torch.exp(-(time[:, None] - time).abs() / self.config.decay).to(self.memory)
-
-    def _imputation_noise(
-        self, pattern: Bool[Tensor, "time channel"], movements: int
-    ) -> Float[Tensor, " channel"]:
-        """s of every channel where left-out movements miss the entries that ``pattern`` misses."""
-        rows = self._spread_out(0, len(self.memory) - 1, min(movements, len(self.memory)))
-        sums = [self._left_out_filled(i, pattern) for i in rows.tolist()]
-        wrong, spread, count = torch.stack(sums).sum(0)
-        return self._unexplained(wrong / count.clamp(min=1), spread / count.clamp(min=1))
-
-    def _left_out_filled(self, i: int, pattern: Tensor) -> Float[Tensor, "3 channel"]:
+        self, gaps: Gaps, i: int, pattern: Tensor, sizes: Sequence[int]
+    ) -> Float[Tensor, "shift size 3 channel"]:
+        """Error sums of a movement filled in by those of other groups."""
         frames = min(len(pattern), int(self.lengths[i]))
         x, seen, pattern = self.memory[i, :frames], self.seen[i, :frames], pattern[:frames]
-        near = self._filled(x, seen & pattern, self.group == self.group[i])
         asked = seen & (~pattern | pattern.all(0))
-        return error_sums(x - near.mean(0), near, asked)
+        both = gaps.filled(x, seen & pattern, self.group != self.group[i], max(sizes))
+        sums = [error_sums(x - y[:n].mean(0), y[:n], asked) for y in both for n in sizes]
+        each: Tensor = torch.stack(sums).unflatten(0, (2, len(sizes)))
+        return each
 
     def _unexplained(self, error: Tensor, spread: Tensor) -> Tensor:
         """s from the mean squared error and the neighbours' variance, at least half the error."""
