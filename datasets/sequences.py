@@ -51,7 +51,7 @@ class Sequences:
     units: tuple[str, ...]
     rate: float
     groups: Groups = field(default_factory=dict)
-    controls: Float[Tensor, "sequence time control"] | None = None
+    controls: Float[Tensor, "sequence known control"] | None = None
     control_names: tuple[str, ...] = ()
     control_units: tuple[str, ...] = ()
     time_normalised: bool = False

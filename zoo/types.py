@@ -94,13 +94,13 @@ class Batch:
     False a program draws its data instead of observing them; see :meth:`unobserved`.
     """
 
-    values: Float[Tensor, "window time channel"]
-    mask: Bool[Tensor, "window time channel"] | None
-    inputs: Float[Tensor, "window time control"] | None
+    values: Float[Tensor, "window *time channel"]
+    mask: Bool[Tensor, "window *time channel"] | None
+    inputs: Float[Tensor, "window *known control"] | None
     start: Int[Tensor, " window"]
     sequence: Int[Tensor, " window"]
-    movements: Float[Tensor, "sequence frame channel"]
-    movement_mask: Bool[Tensor, "sequence frame channel"] | None
+    movements: Float[Tensor, "sequence frame observed"]
+    movement_mask: Bool[Tensor, "sequence frame observed"] | None
     total: int
     total_sequences: int
     observed: bool = True

@@ -5,7 +5,9 @@ from __future__ import annotations
 import doctest
 import importlib
 import inspect
+import re
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -26,11 +28,25 @@ def modules() -> list[str]:
     return names
 
 
+def examples(module: ModuleType) -> list[doctest.DocTest]:
+    """Examples of a module and of what is defined there, inside of decorators too."""
+    things = {id(t): t for t in vars(module).values() if inspect.isclass(t) or inspect.isroutine(t)}
+    own = [t for t in things.values() if t.__module__ == module.__name__]
+    finder = doctest.DocTestFinder()
+    parts = (finder.find(t, module=False, globs=vars(module)) for t in own)  # type: ignore[arg-type]
+    return [example for part in parts for example in part]
+
+
 @pytest.mark.parametrize("name", modules())
 def test_examples_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
-    assert result.failed == 0
+    module = importlib.import_module(name)
+    found, runner = examples(module), doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    for example in found:
+        runner.run(example)
+    assert runner.failures == 0
+    written = re.findall(r"^ *>>> ", inspect.getsource(module), re.MULTILINE)
+    assert sum(len(e.examples) for e in found) == len(written)
 
 
 @pytest.mark.parametrize("name", modules())

@@ -21,6 +21,7 @@ from zoo.storage import FORMAT_VERSION
 
 Meta, Tensors = dict[str, Any], dict[str, Tensor]
 STEPS = ("open", "fsync", "replace", "unlink")
+pytestmark = pytest.mark.usefixtures("unannotated")
 
 
 @pytest.fixture(scope="module")

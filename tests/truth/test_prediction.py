@@ -165,6 +165,7 @@ def test_a_deterministic_prediction_says_so() -> None:
             ask()
 
 
+@pytest.mark.usefixtures("unannotated")
 def test_parts_that_do_not_fit_are_refused() -> None:
     location = torch.zeros(2, *SHAPE)
     with pytest.raises(ValueError, match="noise has shape"):

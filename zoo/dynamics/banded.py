@@ -80,7 +80,7 @@ def conditional(
 
 
 def _solved(
-    Λ: Precision, x: Tensor, missing: list[Int[Tensor, " entry"]], draws: int
+    Λ: Precision, x: Tensor, missing: list[Int[Tensor, " _entry"]], draws: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Means, zero-mean draws and variances, the blocks of the missing entries one after another."""
     roots, links, pulls = _factored(Λ, x, missing)

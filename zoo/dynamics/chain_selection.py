@@ -63,7 +63,7 @@ class Trials:
     fold: Int[Tensor, " sequence"]
     _kept: dict[tuple[tuple[int, ...], bool], Tensor] = field(default_factory=dict, repr=False)
 
-    def sums(self, order: int, jointly: bool) -> list[Float[Tensor, "fold block entry entry"]]:
+    def sums(self, order: int, jointly: bool) -> list[Float[Tensor, "fold block _entry _entry"]]:
         """Sums of runs of every level."""
         lags = lags_up_to(order)
         return [self._level(lags[:j], jointly) for j in range(len(lags) + 1)]

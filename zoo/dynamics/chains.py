@@ -49,10 +49,10 @@ class Chain:
 
     def rolled(
         self,
-        known: Float[Tensor, "*sample window time channel"],
+        known: Float[Tensor, "*#sample window time channel"],
         steps: int,
-        noise: Float[Tensor, "*sample window step channel"] | None = None,
-    ) -> Float[Tensor, "*sample window step channel"]:
+        noise: Float[Tensor, "*#sample window step channel"] | None = None,
+    ) -> Float[Tensor, "*#sample window step channel"]:
         """The frames after ``known``, each from those before it and, where given, its noise."""
         moved = known[..., :0, :] if noise is None else noise
         shapes = (self.intercept.shape[:-2], known.shape[:-3], moved.shape[:-3])
@@ -139,7 +139,7 @@ def sums_of_runs(
 
 
 def chain(
-    sums: Sequence[Float[Tensor, "block entry entry"]],
+    sums: Sequence[Float[Tensor, "block _entry _entry"]],
     lags: Sequence[int],
     ridge: Float[Tensor, " ridge"],
 ) -> Chain:
@@ -154,7 +154,7 @@ def chain(
 
 
 def unexplained(
-    sums: Sequence[Float[Tensor, "block entry entry"]], fitted: Chain
+    sums: Sequence[Float[Tensor, "block _entry _entry"]], fitted: Chain
 ) -> Float[Tensor, "level channel channel"]:
     """Summed outer products of the residuals of every level, of one chain."""
     width = fitted.intercept.shape[-1]

@@ -45,7 +45,7 @@ class CyclePrior:
 
     designs: Float[Tensor, "timing time row"]
     parameters: Float[Tensor, "movement row latent"]
-    residuals: Float[Tensor, "movement time latent"]
+    residuals: Float[Tensor, "recording frame latent"]
     observation: Float[Tensor, "latent latent"]
     bandwidth: float = 0.3
     shrinkage: float = 0.1

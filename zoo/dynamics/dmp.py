@@ -241,7 +241,7 @@ def discrete_basis(
 
 
 def rhythmic_basis(
-    time: Float[Tensor, "*time"],
+    time: Float[Tensor, "*frame"],
     *,
     kernels: int,
     period: float | Tensor,

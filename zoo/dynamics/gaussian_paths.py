@@ -42,7 +42,7 @@ def stationary_draws(
 
 
 def block_diagonal(
-    block: Float[Tensor, "*batch latent latent"], frames: int
+    block: Float[Tensor, "*block latent latent"], frames: int
 ) -> Float[Tensor, "*batch path path"]:
     """One block for all frames, or a block for each."""
     latent = block.shape[-1]

@@ -90,19 +90,19 @@ class Smoother:
     """
 
     noise: PathNoise
-    seen: Bool[Tensor, "*pattern frame"]
-    unroot: Float[Tensor, "*pattern block step step"]
-    begin: Float[Tensor, "*pattern block step 2"]
-    onward: Float[Tensor, "*pattern block 2 step"]
-    state: Float[Tensor, "*pattern block 2 2"]
-    log_root: Float[Tensor, "*pattern frame"]
+    seen: Bool[Tensor, "*#pattern frame"]
+    unroot: Float[Tensor, "*#pattern block step step"]
+    begin: Float[Tensor, "*#pattern block step 2"]
+    onward: Float[Tensor, "*#pattern block 2 step"]
+    state: Float[Tensor, "*#pattern block 2 2"]
+    log_root: Float[Tensor, "*#pattern frame"]
 
     @classmethod
     def of(
         cls,
         noise: PathNoise,
-        ratio: Float[Tensor, "*pattern"],
-        seen: Bool[Tensor, "*pattern frame"],
+        ratio: Float[Tensor, "*#pattern"],
+        seen: Bool[Tensor, "*#pattern frame"],
     ) -> Smoother:
         """The moments under noise ratios ρ, of the frames observed; both broadcast."""
         ρ, seen = torch.broadcast_tensors(ratio[..., None], seen)
@@ -133,14 +133,14 @@ class Smoother:
         return Smoother(self.noise, *parts)
 
     def whiten(
-        self, x: Float[Tensor, "*pattern frame column"]
-    ) -> Float[Tensor, "*pattern frame column"]:
+        self, x: Float[Tensor, "*#pattern frame column"]
+    ) -> Float[Tensor, "*#pattern frame column"]:
         """L⁻¹ x: the errors of the predictions of every frame by those before it, of unit size."""
         return _joined(self._errors(x), self.noise.frames)
 
     def follow(
-        self, x: Float[Tensor, "*pattern frame column"]
-    ) -> Float[Tensor, "*pattern frame column"]:
+        self, x: Float[Tensor, "*#pattern frame column"]
+    ) -> Float[Tensor, "*#pattern frame column"]:
         """E[n | x]: the path of the mean forces."""
         _, lagged, power, ends = _parts(self.noise)
         errors = self._errors(x)
@@ -156,7 +156,7 @@ class Smoother:
         return self.noise.paths(_joined(force, self.noise.frames)[..., :-1, :])
 
     @cached_property
-    def variance(self) -> Float[Tensor, "*pattern frame"]:
+    def variance(self) -> Float[Tensor, "*#pattern frame"]:
         """Var[n | x] of every frame."""
         free, lagged, power, ends = _parts(self.noise)
         path = free @ self.state @ free.mT + lagged @ lagged.mT
@@ -171,7 +171,7 @@ class Smoother:
         found = path.diagonal(dim1=-2, dim2=-1) - known
         return _joined(found[..., None], self.noise.frames)[..., 0].clamp_min(0)
 
-    def _errors(self, x: Tensor) -> Float[Tensor, "*pattern block step column"]:
+    def _errors(self, x: Tensor) -> Float[Tensor, "*#pattern block step column"]:
         """L⁻¹ (x − O a) of every block."""
         power = _parts(self.noise)[2]
         errors = self.unroot @ _cut(x, self.noise)
@@ -192,12 +192,12 @@ def _parts(noise: PathNoise) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return free, lagged / noise.scale, power, step.ends / noise.scale
 
 
-def _cut(x: Tensor, noise: PathNoise) -> Float[Tensor, "*pattern block step column"]:
+def _cut(x: Tensor, noise: PathNoise) -> Float[Tensor, "*#pattern block step column"]:
     full: Tensor = pad(x, (0, 0, 0, noise.blocks * noise.block - noise.frames))
     blocks: Tensor = full.unflatten(-2, (noise.blocks, noise.block))
     return blocks
 
 
-def _joined(x: Tensor, frames: int) -> Float[Tensor, "*pattern frame column"]:
+def _joined(x: Tensor, frames: int) -> Float[Tensor, "*#pattern frame column"]:
     whole: Tensor = x.flatten(-3, -2)
     return whole[..., :frames, :]

@@ -24,14 +24,14 @@ __all__ = ["Population", "estimate"]
 class Population:
     """μ, L and V; ``mean`` may have a leading ``sequence`` axis, and so may the others."""
 
-    mean: Float[Tensor, "*sequence channel parameter"]
-    factors: Float[Tensor, "*sequence channel parameter factor"]
-    private: Float[Tensor, "*sequence channel parameter parameter"]
+    mean: Float[Tensor, "*#sequence channel parameter"]
+    factors: Float[Tensor, "*#sequence channel parameter factor"]
+    private: Float[Tensor, "*#sequence channel parameter parameter"]
 
     def condition(
         self,
-        precision: Float[Tensor, "*sequence channel parameter parameter"],
-        linear: Float[Tensor, "sequence channel parameter"],
+        precision: Float[Tensor, "*#sequence #channel parameter parameter"],
+        linear: Float[Tensor, "*#sequence channel parameter"],
     ) -> Population:
         """Posterior given likelihoods exp(−½ θᵀAθ + bᵀθ) of every channel."""
         solved = _solve(self, precision, linear)
@@ -43,9 +43,9 @@ class Population:
 
     def log_evidence(
         self,
-        precision: Float[Tensor, "channel parameter parameter"],
-        linear: Float[Tensor, "sequence channel parameter"],
-    ) -> Float[Tensor, " sequence"]:
+        precision: Float[Tensor, "*#sequence #channel parameter parameter"],
+        linear: Float[Tensor, "*#sequence channel parameter"],
+    ) -> Float[Tensor, "*sequence"]:
         """Log of the likelihood, integrated over θ, up to terms free of this population."""
         solved = _solve(self, precision, linear)
         at_mean = (self.mean * (linear + solved.error)).sum((-1, -2)) / 2
@@ -162,8 +162,8 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
 
 
 def _times(
-    matrix: Float[Tensor, "*sequence channel p q"], vector: Float[Tensor, "*batch #channel q"]
-) -> Float[Tensor, "*batch channel p"]:
+    matrix: Float[Tensor, "*sequence #channel p q"], vector: Float[Tensor, "*batch #channel q"]
+) -> Float[Tensor, "*rows channel p"]:
     if matrix.ndim == 3:
         return torch.einsum("cpq,...cq->...cp", matrix, vector)
     product: Tensor = matrix @ vector[..., None]

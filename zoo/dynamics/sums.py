@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from zoo.dynamics.kalman import PathNoise, Smoother
@@ -62,7 +62,7 @@ class Sums:
         first = [p.movedim(a, 1)[ratio, channel] for p, a in zip(wide, CHANNEL, strict=True)]
         return Sums(*(p.movedim(0, a) for p, a in zip(first, CHANNEL, strict=True)))
 
-    def of_movements(self, rows: Int[Tensor, " some"]) -> Sums:
+    def of_movements(self, rows: Shaped[Tensor, " some"]) -> Sums:
         """Those of some movements."""
         precision, *rest = self.parts
         alike = len(precision) == 1

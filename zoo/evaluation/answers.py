@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from zoo.prediction import Prediction
@@ -104,7 +104,7 @@ def clusters(groups: Groups | None, count: int, by: str | None = None) -> Int[Te
 
 
 def group_sums(
-    values: Float[Tensor, "sequence *rest"], cluster: Int[Tensor, " sequence"]
+    values: Shaped[Tensor, "sequence *rest"], cluster: Int[Tensor, " sequence"]
 ) -> Float[Tensor, "group *rest"]:
     """Sums of the rows of every group, in float64."""
     rows = values.double()

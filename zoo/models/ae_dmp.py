@@ -289,6 +289,7 @@ class AeDmp(nn.Module):
         guide, x = _need(posterior), batch.values
         if batch.mask is None:
             return guide.encode(x).mean, torch.ones_like(x[..., 0], dtype=torch.bool)
+        x = torch.where(batch.mask, x, 0.0)
         for _ in range(self.config.chain):
             x = torch.where(batch.mask, x, self.decoder(guide.encode(x).mean))
         return guide.encode(x).mean, batch.mask.any(-1)

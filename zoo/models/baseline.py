@@ -67,7 +67,7 @@ def moments(values: Tensor, mask: Tensor, dim: int) -> tuple[Tensor, Tensor, Ten
     return mean, variance.sqrt(), count
 
 
-def seen_entries(batch: Batch) -> Bool[Tensor, "window time channel"]:
+def seen_entries(batch: Batch) -> Bool[Tensor, "window *time channel"]:
     """The mask of a batch, spelled out where it is complete."""
     if batch.mask is not None:
         return batch.mask

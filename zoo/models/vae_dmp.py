@@ -284,7 +284,7 @@ class VaeDmp(LatentDmp):
             check_end(self.label, self.frames, seen, length - seen)
         prior = self._prior(length)
         where = torch.arange(length) < seen
-        y = self.embed(posterior.encode(batch.values).mean)
+        y = self.embed(posterior.encode(batch.values, batch.mask).mean)
         extra = None
         if batch.mask is not None and _is_one_section(batch.mask):
             where[:seen] = batch.mask[0, :, 0]
