@@ -15,6 +15,7 @@ from scipy import stats
 from sklearn.isotonic import IsotonicRegression
 
 from zoo.errors import FewGroupsWarning, NoDensityError, UnknownNameError
+from zoo.evaluation.answers import Answer
 from zoo.evaluation.calibration import (
     RECALIBRATIONS,
     Conformal,
@@ -22,6 +23,7 @@ from zoo.evaluation.calibration import (
     recalibrate,
     recalibration_from_state,
 )
+from zoo.evaluation.factors import crossed, standardised
 from zoo.evaluation.promise import promised
 from zoo.evaluation.scores import score
 from zoo.prediction import Prediction, Predictive
@@ -316,3 +318,18 @@ def test_what_cannot_be_calibrated_is_refused_with_its_reason() -> None:
     still = items(torch.zeros(5, 1), noise=torch.zeros(1).double())
     with pytest.raises(ValueError, match="spread of 0"):
         recalibrate("scale", still, torch.ones(5, 1))
+
+
+@pytest.mark.parametrize("by", [("channel",), ("time",), ("channel", "time")])
+def test_the_factors_of_a_group_are_those_of_the_others(by: tuple[Any, ...]) -> None:
+    """A truth blown up in a channel and at the end moves all factors but those of its group."""
+    raw, truth = walks(12, 3)
+    wild = truth.clone()
+    wild[4, 20:, 2] *= 100
+    found = []
+    for told in (truth, wild):
+        answer = Answer.of(raw, told)
+        found.append(crossed(standardised(answer).abs(), answer, by, 1, common=False))
+    assert torch.equal(found[0][4], found[1][4])
+    others = torch.arange(12) != 4
+    assert not torch.equal(found[0][others], found[1][others])
