@@ -6,7 +6,7 @@ CORE := $(VENV)-core
 export PYTHONSAFEPATH := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: help demo test lint types units notebooks core clean
+.PHONY: help demo test lint types units notebooks core mutants clean
 
 help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -42,6 +42,9 @@ $(CORE)/.installed: $(INSTALLED) $(shell git ls-files zoo guides datasets result
 	$(BIN)/python -m build --wheel --outdir $(CORE)/dist . > $(CORE)/build.log
 	$(CORE)/bin/python -m pip install --quiet --constraint constraints.txt $(CORE)/dist/*.whl
 	touch $@
+
+mutants: $(INSTALLED)  ## Break the code on purpose, one line at a time, and count what the tests notice
+	$(BIN)/python tests/mutants.py
 
 clean:  ## Remove environments and caches
 	rm -rf $(VENV) $(CORE) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
