@@ -22,6 +22,9 @@ def main() -> None:
             settings = {"epochs": 2} if name == "vae-dmp" else {}
             run = zoo.fit(zoo.create(name, train, **settings), train).calibrate(calib)
             zoo.load(run.save(Path(folder) / name)).reconstruct(calib)
+            again = {"run_dir": Path(folder) / f"{name}-kept", "resume": "auto"}
+            kept = [zoo.fit(zoo.create(name, train, **settings), train, **again) for _ in range(2)]
+            assert kept[0].made_of == kept[1].made_of and kept[0].seconds == kept[1].seconds
             print(zoo.evaluate(run, calib[:1]).to_markdown() if name == "dmp" else name)
     listing = subprocess.run(
         [sys.executable, "-m", "zoo", "list", "--json"], check=True, capture_output=True, text=True

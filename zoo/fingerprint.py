@@ -12,6 +12,7 @@ from importlib.metadata import version
 from typing import Any
 
 import torch
+from torch import nn
 
 from zoo import archive
 from zoo.assembly import Assembly
@@ -42,8 +43,8 @@ def fingerprint(
     entry = assembly.entry
     return {
         "entry": entry.name,
-        "model": entry.model,
-        "guide": str(entry.guide),
+        "model": _path(assembly.model),
+        "guide": _path(assembly.guide),
         "inference": type(assembly.inference).__name__,
         **_settings(assembly),
         "scaling": assembly.scaling,
@@ -53,7 +54,7 @@ def fingerprint(
         **contents(train, "training"),
         **contents(val, "validation"),
         **_versions(),
-        **code([p.partition(":")[0] for p in (entry.model, entry.guide) if p] + ["zoo.training"]),
+        **code(_roots(assembly)),
         "initial parameters": _initial(assembly),
     }
 
@@ -69,19 +70,36 @@ def code(roots: Iterable[str]) -> dict[str, str]:
     return {f"code of {module}": f"#{digest}" for module, digest in hashes(roots).items()}
 
 
+def _path(part: nn.Module | None) -> str:
+    return "none" if part is None else f"{type(part).__module__}:{type(part).__qualname__}"
+
+
+def _roots(assembly: Assembly) -> list[str]:
+    """Modules whose code decides the result: the entry's, those of what stands in for it, ours."""
+    named = [p.partition(":")[0] for p in (assembly.entry.model, assembly.entry.guide) if p]
+    own = {"zoo", *(module.partition(".")[0] for module in named)}
+    used = [type(part).__module__ for part in (assembly.model, assembly.guide)]
+    return [*named, *(m for m in used if m.partition(".")[0] in own), "zoo.training"]
+
+
 def _settings(assembly: Assembly) -> dict[str, str]:
     """All settings, those left at their defaults too."""
     parts: dict[str, Any] = {"model": assembly.model, "guide": assembly.guide}
     found = {
         f"{name} of the {part}": _plain(value)
         for part, module in parts.items()
-        if module is not None
-        for name, value in asdict(module.config).items()
+        for name, value in _fields(module).items()
     }
     strategy = asdict(assembly.inference).items()
     return found | {
         f"{name} of the training": _plain(v) for name, v in strategy if name not in FREE
     }
+
+
+def _fields(module: Any) -> dict[str, Any]:
+    """Fields of the part's Config; an automatic guide has none."""
+    config = getattr(module, "config", None)
+    return {} if config is None else asdict(config)
 
 
 def _plain(value: object) -> str:

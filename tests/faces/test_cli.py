@@ -223,7 +223,9 @@ def test_a_report_is_in_the_units_of_the_data() -> None:
     assert zoo.fit(zoo.create("mean-regressor", data), data).report() == {}
 
 
-def test_an_interrupted_fit_says_so_and_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_fit_says_so_and_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = [sys.executable, "-c", "import sys; from zoo.cli import main; sys.exit(main())"]
     words += ["fit", "vae", "--data", "robot-arm", "--run-dir", str(tmp_path), "--json"]
     words += ["--calibrate", "none", "--set", "epochs=20000", "--set", "checkpoint_every=1"]
@@ -237,6 +239,10 @@ def test_an_interrupted_fit_says_so_and_goes_on(tmp_path: Path) -> None:
     assert training.returncode == 130
     assert "interrupted in epoch" in error and "--resume" in error and "Traceback" not in error
     assert json.loads((tmp_path / "checkpoint.json").read_text())
+    assert main(words[3:]) == 2
+    assert "holds a begun training: resume='auto' (--resume) to go on" in capsys.readouterr().err
+    assert main([*words[3:], "--resume", "--set", "epochs=20001"]) == 2
+    assert "epochs of the training was 20000 and is 20001 now" in capsys.readouterr().err
 
 
 def _wait_for(file: Path, training: subprocess.Popen[str]) -> None:

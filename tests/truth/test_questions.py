@@ -47,7 +47,7 @@ def test_what_cannot_be_calibrated_is_a_warning(whole: zoo.Run) -> None:
     )
     setup = zoo.Setup(seen=10, draws=20)
     with pytest.warns(NotCalibratedWarning, match="reconstruct has no answer .* stays uncal"):
-        whole.calibrate(unseen, setup=setup)
+        whole.calibrate(unseen, method="scale", setup=setup)
     assert "forecast" in whole.recalibrations and "reconstruct" not in whole.recalibrations
 
 

@@ -173,7 +173,7 @@ def test_settings_that_change_no_bits_do_not_count(trained: tuple[Path, zoo.Run]
 def test_a_finished_run_comes_back_as_fit_gave_it(tmp_path: Path) -> None:
     """Its calibration is not the training's; the folder keeps it."""
     run = zoo.fit(zoo.create("mean", TRAIN), TRAIN, run_dir=tmp_path)
-    run.calibrate(movements()[6:]).save(tmp_path)
+    run.calibrate(movements()[6:], method="scale").save(tmp_path)
     again = zoo.fit(zoo.create("mean", TRAIN), TRAIN, run_dir=tmp_path, resume="auto")
     assert again.recalibrations == {} and zoo.load(tmp_path).recalibrations
 
