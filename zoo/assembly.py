@@ -14,6 +14,7 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
+from zoo.automatic import with_guide
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import UnknownNameError
@@ -110,7 +111,9 @@ def create(
     Every keyword goes to each part that has a field of that name: the model's and the guide's
     ``Config`` and the inference strategy. An unknown keyword or model lists the nearest names.
     Fewer ``epochs`` than the entry's shorten its tempering and warm-up in proportion, unless these
-    are given too.
+    are given too. ``guide="auto-normal"`` (or ``"auto-delta"``, ``"auto-multivariate-normal"``)
+    replaces the entry's guide by one that Pyro makes, trained on minibatches of the bound; models
+    whose latent sites belong to single windows, movements or items refuse it.
 
     >>> import numpy as np, zoo
     >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
@@ -126,7 +129,8 @@ def assemble(
     """Build model and guide of ``entry`` for ``layout`` from a seed."""
     if layout.kind != entry.data:
         raise ValueError(f"{entry.name} needs {entry.data}; got {layout.kind}")
-    known = options(entry)
+    entry = with_guide(entry, settings.get("guide"))
+    known = {*options(entry), "guide"}
     for key in settings:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=3, cutoff=0.4) or sorted(known)

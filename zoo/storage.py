@@ -20,6 +20,7 @@ from zoo.catalogue import CATALOGUE
 from zoo.datasets.scaling import Scaler
 from zoo.errors import DamagedRunError, RunExistsError
 from zoo.evaluation.calibration import recalibration_from_state
+from zoo.inference.train import Builds
 from zoo.run import Run
 from zoo.types import Layout
 
@@ -127,6 +128,8 @@ def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
     modules = {name: module for name, module in parts.items() if module is not None}
     _check_names(tensors, [*modules, *(f"recalibration.{task}" for task in index.recalibrations)])
     for name, module in modules.items():
+        if isinstance(module, Builds):
+            module.build()
         archive.restore(module, name, tensors)
         module.eval()
     return Run(

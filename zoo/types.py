@@ -105,6 +105,25 @@ class Batch:
     total_sequences: int
     observed: bool = True
 
+    @classmethod
+    def blank(cls, layout: Layout, dtype: torch.dtype) -> Self:
+        """One movement or item of zeros: what a program must see to know the sizes of its sites."""
+        frames = () if layout.kind == "pairs" else (layout.frames or 1,)
+        values = torch.zeros(1, *frames, len(layout.channels), dtype=dtype)
+        inputs = torch.zeros(1, *frames, len(layout.inputs), dtype=dtype)
+        zero = torch.zeros(1, dtype=torch.long)
+        return cls(
+            values=values,
+            mask=None,
+            inputs=inputs if layout.inputs else None,
+            start=zero,
+            sequence=zero,
+            movements=values if frames else values.new_empty(0, 0, values.shape[-1]),
+            movement_mask=None,
+            total=1,
+            total_sequences=len(frames),
+        )
+
     def __len__(self) -> int:
         """Number of windows."""
         return int(self.values.shape[0])

@@ -13,11 +13,14 @@ import pytest
 import torch
 from pyro import poutine
 from pyro.infer import SVI, Predictive, Trace_ELBO
+from pyro.poutine.util import prune_subsample_sites
 from support import data_of, run_of
 from torch import Tensor
 
+import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.dynamics.ancestral import Ancestral
+from zoo.errors import NotCapableError
 from zoo.inference.loader import Loader
 from zoo.strategies import Svi
 from zoo.types import Batch
@@ -164,3 +167,22 @@ def test_steps_of_pyros_own_inference_move_every_parameter(name: str) -> None:
     assert all(map(math.isfinite, losses))
     after = {f"{n}.{k}": v for n, m in parts.items() for k, v in m.named_parameters()}
     assert {k for k, v in after.items() if torch.equal(v, before[k])} == set()
+
+
+def latent_shapes(run: Any, data: Any) -> dict[str, torch.Size]:
+    """Shapes of an entry's latent sites on all of ``data``."""
+    batch = Loader(data, batch_size=len(data)).take(torch.arange(len(data)))
+    trace = prune_subsample_sites(poutine.trace(run.model).get_trace(batch))
+    return {name: trace.nodes[name]["value"].shape for name in trace.stochastic_nodes}
+
+
+@every
+def test_automatic_guides_are_refused_where_sites_are_as_many_as_the_data(name: str) -> None:
+    run = run_of(name)
+    data = run.exchange.scaled(data_of(run.assembly.entry))
+    few, many = latent_shapes(run, data[:3]), latent_shapes(run, data)
+    names = getattr(run.model, "global_sites", ())
+    assert {site for site, shape in few.items() if many[site] == shape} == set(names)
+    if not names:
+        with pytest.raises(NotCapableError, match="allows no automatic guide"):
+            zoo.create(name, data_of(run.assembly.entry), guide="auto-normal")

@@ -27,6 +27,7 @@ FLOORS = {
     "zoo.guides": 2,
     "zoo.evaluation": 2,
     "zoo.player": 2,
+    "zoo.automatic": 3,
     "zoo.catalogue": 3,
     "zoo.assembly": 4,
     "zoo.tasks": 4,

@@ -9,6 +9,7 @@ from typing import Any
 
 import pyro
 import torch
+from pyro.distributions import Delta
 from pyro.infer import Trace_ELBO
 from pyro.poutine.messenger import Messenger
 from pyro.poutine.util import site_is_subsample
@@ -162,7 +163,7 @@ class _Record(Messenger):
 
 
 def _divergence(q: Site, p: Site, *, closed: bool) -> Tensor:
-    if closed:
+    if closed and not _is_point(q["fn"]):
         try:
             kl = torch.distributions.kl_divergence(q["fn"], p["fn"])
         except NotImplementedError:
@@ -170,6 +171,13 @@ def _divergence(q: Site, p: Site, *, closed: bool) -> Tensor:
         else:
             return _weighted(kl.expand(q["fn"].batch_shape), q)
     return log_density(q) - log_density(p)
+
+
+def _is_point(fn: Any) -> bool:
+    """Whether draws are a point, whose log density Pyro's own KL leaves out."""
+    while hasattr(fn, "base_dist"):
+        fn = fn.base_dist
+    return isinstance(fn, Delta)
 
 
 def _weighted(each: Tensor, site: Site) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -19,6 +19,8 @@ from zoo.strategies import Exact, Inference, MarginalLikelihood, Svi
 from zoo.types import Batch, Posterior
 
 __all__ = [
+    "Adopts",
+    "Builds",
     "Conditions",
     "LearnsNoise",
     "LearnsPrior",
@@ -55,6 +57,28 @@ class Prepares(Protocol):
 
     def prepare(self, data: Any) -> None:
         """Fill buffers, such as a period; the model comes before its guide."""
+        ...
+
+
+@runtime_checkable
+class Builds(Protocol):
+    """A guide that is made from its model, once that has its constants."""
+
+    def build(self) -> None:
+        """Make the parameters."""
+        ...
+
+    def moments(self) -> Mapping[str, tuple[Tensor, Tensor]]:
+        """Mean of each latent site, and a root of its covariance."""
+        ...
+
+
+@runtime_checkable
+class Adopts(Protocol):
+    """A model that predicts from a Gaussian of its latent sites, however that was found."""
+
+    def adopt(self, found: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+        """Keep mean and root of the covariance of each site."""
         ...
 
 
@@ -178,9 +202,12 @@ def _variational(
 ) -> list[dict[str, Any]]:
     if guide is None:
         raise TypeError(f"{type(model).__name__} has no guide to train by variational inference")
-    for part in (model, guide):
-        if isinstance(part, Prepares):
-            part.prepare(train)
+    with seeded(session.seed, session.device):
+        for part in (model, guide):
+            if isinstance(part, Prepares):
+                part.prepare(train)
+        if isinstance(guide, Builds):
+            guide.build()
     history = fit_svi(
         model,
         guide,
@@ -194,6 +221,8 @@ def _variational(
         progress=session.progress,
         tensorboard=session.tensorboard,
     )
+    if isinstance(guide, Builds) and isinstance(model, Adopts):
+        model.adopt(guide.moments())
     return history.rows
 
 

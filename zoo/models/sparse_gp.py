@@ -50,6 +50,7 @@ class SparseGaussianProcess(nn.Module):
     """
 
     config_class: ClassVar[type] = Config
+    global_sites: ClassVar[tuple[str, ...]] = ("v",)
     dtype: ClassVar[torch.dtype] = torch.float64
 
     inducing: Tensor
