@@ -16,7 +16,7 @@ from zoo.assembly import Assembly
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.calibration import recalibration_from_state
-from zoo.exchange import check_unseen, question
+from zoo.exchange import check_unseen, fingerprints, question
 from zoo.fitting import fit
 from zoo.mixtures import pooled
 from zoo.prediction import Prediction, Recalibration
@@ -35,6 +35,7 @@ FORMAT_VERSION = 1
 class _Index:
     members: int
     recalibrations: dict[str, dict[str, Any]]
+    calibrated_on: list[str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +60,7 @@ class Ensemble:
 
     members: tuple[Run, ...]
     recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+    calibrated_on: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Refuse an empty ensemble, and members of different channels, units or rates."""
@@ -151,6 +153,7 @@ class Ensemble:
         """Fit and keep a correction of every spread on movements that no member saw."""
         check_unseen(data, self.trained_on["fingerprints"], "calibration")
         self.recalibrations.update(corrections(self, data, method, tasks, setup))
+        self.calibrated_on.extend(fingerprints(data))
         return self
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
@@ -164,7 +167,11 @@ class Ensemble:
         for task, recalibration in self.recalibrations.items():
             states[task], extra = recalibration.state()
             tensors.update({f"{task}.{k}": v for k, v in extra.items()})
-        meta = {"members": len(self.members), "recalibrations": states}
+        meta = {
+            "members": len(self.members),
+            "recalibrations": states,
+            "calibrated_on": self.calibrated_on,
+        }
         archive.write(folder, "ensemble", meta, tensors, version=FORMAT_VERSION)
         return folder
 
@@ -184,7 +191,7 @@ class Ensemble:
                 f"{folder}/ensemble.json does not describe an ensemble: {error}"
             ) from error
         members = tuple(load_run(folder / f"member-{i}") for i in range(index.members))
-        return cls(members=members, recalibrations=found)
+        return cls(members=members, recalibrations=found, calibrated_on=index.calibrated_on)
 
     def _pooled(
         self, task: str, predict: Callable[[Run, int], Prediction], seed: int

@@ -205,13 +205,15 @@ def fingerprints(data: Pairs | Sequences) -> list[str]:
     return [_digest(*row) for row in rows]
 
 
-def check_unseen(data: Pairs | Sequences, trained_on: Sequence[str], purpose: str) -> None:
-    """Warn where movements or items, or their equals, were trained on."""
-    known = set(trained_on)
+def check_unseen(
+    data: Pairs | Sequences, known: Iterable[str], purpose: str, used: str = "trained on"
+) -> None:
+    """Warn where movements or items, or their equals, were trained or calibrated on."""
+    known = set(known)
     again = sum(f in known for f in fingerprints(data))
     if again:
         warnings.warn(
-            f"{again} of {len(data)} movements or items given for {purpose} were trained on "
+            f"{again} of {len(data)} movements or items given for {purpose} were {used} "
             "(these or equal ones); spreads on them look better than they are",
             stacklevel=3,
         )

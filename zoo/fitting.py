@@ -60,7 +60,9 @@ def fit(
     folder, made_of = Path(run_dir), fingerprint(assembly, train, val)
     with claimed(folder, made_of, resume, overwrite) as finished:
         if finished:
-            return replace(load_run(folder, device=assembly.device), recalibrations={})
+            return replace(
+                load_run(folder, device=assembly.device), recalibrations={}, calibrated_on=[]
+            )
         run = _fitted(assembly, train, val, replace(session, folder=folder), made_of)
         save_run(run, folder)
     return run

@@ -17,7 +17,7 @@ from zoo.datasets.scaling import Scaler
 from zoo.errors import NotCapableError
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
-from zoo.exchange import Answer, Exchange, check_timing, check_unseen, question
+from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.prediction import Prediction, Predictive, Recalibration
@@ -33,7 +33,8 @@ class Run:
     """A trained model: predictions in the data's own units, calibration, saving.
 
     ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
-    ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed;
+    ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed,
+    as ``calibrated_on`` are of those that bands were calibrated on;
     ``made_of`` all that determined it (:mod:`zoo.fingerprint`), empty where it was trained without
     a folder; ``seconds`` the wall clock of its training.
     """
@@ -45,6 +46,7 @@ class Run:
     trained_on: dict[str, Any]
     made_of: dict[str, str] = field(default_factory=dict)
     recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+    calibrated_on: list[str] = field(default_factory=list)
 
     def __repr__(self) -> str:
         """Model, data, tasks and calibration in one line."""
@@ -183,6 +185,7 @@ class Run:
         """
         check_unseen(data, self.trained_on["fingerprints"], "calibration")
         self.recalibrations.update(corrections(self, data, method, tasks, setup))
+        self.calibrated_on = [*self.calibrated_on, *fingerprints(data)]
         return self
 
     def report(self) -> dict[str, Any]:
@@ -248,6 +251,7 @@ def evaluate(
     A task without an answer on these data is a line that says why; the others are scored.
     """
     check_unseen(data, run.trained_on["fingerprints"], "evaluation")
+    check_unseen(data, run.calibrated_on, "evaluation", "calibrated on")
     found, refused = posed(run, data, tasks, setup)
     scores = [(t.task, score(t.prediction, t.truth, t.mask, t.groups)) for t in found]
     return Table.of(run.name, data.name, scores, refused)

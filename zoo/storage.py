@@ -50,6 +50,7 @@ class _Index:
     trained_on: _TrainedOn
     made_of: dict[str, str]
     recalibrations: dict[str, dict[str, Any]]
+    calibrated_on: list[str]
     versions: dict[str, str]
 
 
@@ -78,6 +79,7 @@ def save_run(run: Run, folder: Path, *, overwrite: bool = False) -> Path:
         "trained_on": run.trained_on,
         "made_of": run.made_of,
         "recalibrations": corrections,
+        "calibrated_on": run.calibrated_on,
         "versions": {"movezoo": zoo.__version__, **{n: installed(n) for n in _LIBRARIES}},
     }
     archive.write(folder, "run", meta, tensors, version=FORMAT_VERSION)
@@ -143,6 +145,7 @@ def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
             task: recalibration_from_state(state, _part(tensors, f"recalibration.{task}."))
             for task, state in index.recalibrations.items()
         },
+        calibrated_on=index.calibrated_on,
     )
 
 

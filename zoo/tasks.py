@@ -73,6 +73,11 @@ class Trained(Predictor, Protocol):
         """``name`` and ``fingerprints`` of the training data."""
         ...
 
+    @property
+    def calibrated_on(self) -> list[str]:
+        """Fingerprints of the movements or items that its bands were calibrated on."""
+        ...
+
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:

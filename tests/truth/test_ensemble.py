@@ -64,7 +64,8 @@ def test_an_ensemble_is_calibrated_and_scored_like_a_run() -> None:
     ensemble.calibrate(held_out, method="scale", setup=SETUP)
     known = held_out.frames(0, 12)
     assert ensemble.forecast(known, horizon=12).recalibration is not None
-    table = zoo.evaluate(ensemble, held_out, setup=SETUP)
+    with pytest.warns(UserWarning, match="2 of 2 .* were calibrated on"):
+        table = zoo.evaluate(ensemble, held_out, setup=SETUP)
     assert {row.task for row in table.rows} >= {"forecast"}
 
 

@@ -49,7 +49,7 @@ def test_a_movement_is_answered_as_it_is_alone(name: str) -> None:
         torch.testing.assert_close(together.std[row, :frames], alone.std[0])
 
 
-@pytest.mark.filterwarnings("ignore:.* were trained on")
+@pytest.mark.filterwarnings("ignore:.* were (trained|calibrated) on")
 @pytest.mark.parametrize("method", ["conformal", "isotonic", "scale"])
 @pytest.mark.parametrize("name", ["pca", "mean", "vae", "ar"])
 def test_ragged_movements_are_scored_and_calibrated(name: str, method: str) -> None:
@@ -80,6 +80,21 @@ def test_what_was_trained_on_is_noticed(name: str) -> None:
     with pytest.warns(UserWarning, match=f"^{half} of {half} .* given for calibration"):
         run.calibrate(data[:half], method="scale")
     zoo.evaluate(run, data[half:])
+
+
+def test_what_was_calibrated_on_is_noticed(tmp_path: Path) -> None:
+    """Bands are right by construction where they were fitted: said after saving and loading too."""
+    data = data_of(CATALOGUE["pca"])
+    run = zoo.fit(assembly_of(CATALOGUE["pca"]), data[:4])
+    ensemble = zoo.Ensemble(members=(run,))
+    for found in (run, ensemble):
+        found.calibrate(data[4:6], method="scale")
+        again = type(found).load(found.save(tmp_path / found.name)) if found is ensemble else found
+        with pytest.warns(UserWarning, match=r"^1 of 2 .* for evaluation were calibrated on"):
+            zoo.evaluate(again, data[5:7])
+        zoo.evaluate(again, data[6:])
+    loaded = zoo.load(run.save(tmp_path / "run"))
+    assert loaded.calibrated_on == run.calibrated_on and len(run.calibrated_on) == 2
 
 
 def test_fingerprints_tell_apart_all_that_differs() -> None:
