@@ -117,7 +117,7 @@ def forecast(
     mask: Bool[Tensor, "query time channel"],
     horizon: int,
     choice: Choice,
-) -> Float[Tensor, "neighbour query time channel"]:
+) -> Float[Tensor, "neighbour query step channel"]:
     """The continuations of the nearest places."""
     context = min(choice.context, x.shape[1])
     start: Places = dips(library.costs(x, mask, [context])[0], choice.neighbours)
