@@ -51,7 +51,7 @@ class Config:
 
 
 class RecognisedNoise(RecurrentNoise):
-    """q(w | x): w_1 from the first frames, w_{t+1} ~ N(μ(x_{t+1}, z_t), σ²(x_{t+1}, z_t)), (79)."""
+    """q(w | x, a): w_1 from the first frames, w_{t+1} ~ N(μ, σ²) of (x_{t+1}, z_t, a_t), (79)."""
 
     def __init__(
         self,
@@ -95,34 +95,40 @@ class RecognisedNoise(RecurrentNoise):
 
 
 class SequentialGuide(nn.Module):
-    """q(w_{1:T} | x_{1:T}) of windows; Karl et al., *Deep variational Bayes filters*, ICLR 2017."""
+    """q(w_{1:T} | x_{1:T}, a_{1:T−1}) of windows; every moment is of frames, states and actions.
+
+    w_1 is read from the first frames and the actions at them. Karl, Soelch, Bayer & van der Smagt,
+    *Deep variational Bayes filters*, ICLR 2017, eq. 8: q(w_{t+1} | z_t, x_{t+1}, u_t).
+    """
 
     config_class: ClassVar[type] = Config
 
     def __init__(self, layout: Layout, model: StateSpace, config: Config) -> None:
-        """Networks for ``layout``'s channels and the state of ``model``."""
+        """Networks for ``layout``'s channels and controls and the state of ``model``."""
         super().__init__()
         object.__setattr__(self, "_model", model)
         self.config = config
-        channels, latent = len(layout.channels), model.latent_dim
-        self.trunk = trunk([config.memory * channels, config.hidden])
+        latent, self.controls = model.latent_dim, len(layout.inputs)
+        inputs = len(layout.channels) + self.controls
+        self.trunk = trunk([config.memory * inputs, config.hidden])
         self.first = GaussianHead(config.hidden, latent, initial=config.noise_std)
         self.noise = NoiseNetwork(
-            channels=channels, latent_dim=latent, hidden=config.hidden, initial=config.noise_std
+            channels=inputs, latent_dim=latent, hidden=config.hidden, initial=config.noise_std
         )
 
     def forward(self, batch: Batch) -> None:
         """The Pyro program of the one latent site."""
         model: StateSpace = self.__dict__["_model"]
         windows, time = batch.values.shape[:2]
+        actions = model.actions(batch, time - 1)
         with pyro.plate("windows", batch.total, subsample=torch.arange(windows)):
             noise = RecognisedNoise(
                 self.noise,
-                self.noise.features(batch.values.transpose(0, 1)[1:]),
-                self.first(self.trunk(self._beginning(batch.values))),
+                self.noise.features(_beside(batch.values[:, 1:], actions).transpose(0, 1)),
+                self.first(self.trunk(self._beginning(batch.values, actions))),
                 model.begin,
                 model.transition,
-                model.actions(batch, time - 1),
+                actions,
             )
             pyro.sample("w", noise)
 
@@ -131,15 +137,30 @@ class SequentialGuide(nn.Module):
         values: Float[Tensor, "*batch channel"],
         mask: Bool[Tensor, "*batch channel"] | None = None,
     ) -> torch.distributions.Normal:
-        """q(w_1) of frames that stand still; missing entries count as the training mean, 0."""
+        """q(w_1) of frames that stand still under the mean action; missing entries count as 0."""
         seen = values if mask is None else torch.where(mask, values, 0.0)
-        repeated = seen.repeat_interleave(self.config.memory, -1).unflatten(
-            -1, (-1, self.config.memory)
-        )
-        mean, std = self.first(self.trunk(repeated.transpose(-1, -2).flatten(-2)))
+        known = torch.nn.functional.pad(seen, (0, self.controls))
+        repeated = known[..., None, :].expand(*known.shape[:-1], self.config.memory, -1)
+        mean, std = self.first(self.trunk(repeated.flatten(-2)))
         return torch.distributions.Normal(mean, std)
 
-    def _beginning(self, values: Float[Tensor, "window time channel"]) -> Tensor:
-        """The first frames side by side; of shorter windows the last is repeated."""
+    def _beginning(
+        self,
+        values: Float[Tensor, "window time channel"],
+        actions: Float[Tensor, "window step control"] | None,
+    ) -> Float[Tensor, "window feature"]:
+        """The first frames and their actions side by side; of shorter windows the last repeated.
+
+        The action at a window's last frame is not known, and counts as the mean, 0.
+        """
+        acted = None if actions is None else torch.nn.functional.pad(actions, (0, 0, 0, 1))
+        known = _beside(values, acted)
         frame = torch.arange(self.config.memory, device=values.device)
-        return values[:, frame.clamp(max=values.shape[1] - 1)].flatten(1)
+        return known[:, frame.clamp(max=values.shape[1] - 1)].flatten(1)
+
+
+def _beside(
+    values: Float[Tensor, "window time channel"],
+    actions: Float[Tensor, "window time control"] | None,
+) -> Float[Tensor, "window time input"]:
+    return values if actions is None else torch.cat([values, actions], -1)

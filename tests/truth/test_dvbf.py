@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyro.distributions as dist
+import pyro.poutine as poutine
 import pytest
 import torch
 from torch import Tensor
@@ -81,10 +83,12 @@ def test_both_programs_are_those_of_the_equations(controls: bool) -> None:
     path = by_hand(model, w, actions)
     x = dist.Normal(model.decoder(path), model.output_std).log_prob(batch.values).sum()
     prior = dist.Normal(0.0, 1.0).log_prob(w).sum()
-    mean, std = guide.first(guide.trunk(batch.values[:, :2].flatten(1)))
+    known = [batch.values[:, :2]] if actions is None else [batch.values[:, :2], actions[:, :2]]
+    mean, std = guide.first(guide.trunk(torch.cat(known, -1).flatten(1)))
     q = dist.Normal(mean, std).log_prob(w[:, 0]).sum()
     for t in range(FRAMES - 1):
-        moments = guide.noise(guide.noise.features(batch.values[:, t + 1]), path[:, t])
+        after = [batch.values[:, t + 1]] + ([] if actions is None else [actions[:, t]])
+        moments = guide.noise(guide.noise.features(torch.cat(after, -1)), path[:, t])
         q = q + dist.Normal(*moments).log_prob(w[:, t + 1]).sum()
     parameters = [*model.parameters(), *guide.parameters()]
     traced = sum(_density(site) for site in found.model.values())
@@ -102,6 +106,24 @@ def test_a_value_that_was_not_drawn_has_the_same_density() -> None:
     noise = sites(model, guide, batch).guide["w"]["fn"]
     value = noise.rsample()
     torch.testing.assert_close(noise.log_prob(value), noise.log_prob(value.clone()))
+
+
+def test_recognition_sees_the_actions() -> None:
+    """The same frames and states under other actions have other noise, at the steps they act on."""
+    _, guide, batch = build(movements(True))
+    assert batch.inputs is not None
+    other = batch.inputs.clone()
+    other[:, 4] += 1.0
+
+    def moments(actions: Tensor) -> tuple[Tensor, Tensor]:
+        acted = replace(batch, inputs=actions)
+        noise = poutine.trace(guide).get_trace(acted).nodes["w"]["fn"]
+        noise.step = lambda z, w, a: 0.9 * z + w
+        return noise.moments(torch.ones(4, FRAMES, LATENT))
+
+    for before, after in zip(moments(batch.inputs), moments(other), strict=True):
+        changed = (before != after).any(-1).any(-1)
+        assert changed.tolist() == [t == 5 for t in range(FRAMES)]
 
 
 def test_one_basis_is_a_linear_gaussian_model() -> None:

@@ -60,7 +60,9 @@ class Dvbf(nn.Module):
     have none. A forecast filters the frames seen and goes on with noise from the prior; it needs
     the actions to come. Missing entries are left out of the likelihood and are 0, the training
     mean, to the guide. It has no goal and fills no gaps from both sides (no generate, no impute);
-    networks are point estimates, so that bands want calibration.
+    the matrices and all networks are point estimates (Karl et al. have q(v) over the matrices), and
+    w_1 is recognised from five frames, not by a smoother over the whole window: bands want
+    calibration.
 
     Defaults: 8 coordinates, 16 bases, 200 hidden units, σ constant in time; data standardised.
     """
