@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zoo.leaderboard.statistics import interval
-from zoo.leaderboard.tables import DEG2, Board
+from zoo.leaderboard.tables import Board
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +44,7 @@ def draw(board: Board) -> Figure:
 def _errors(axes: Axes, board: Board) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    factor, unit = (DEG2, "deg²") if board.unit == "rad" else (1.0, f"{board.unit}²")
+    factor, unit = board.squared
     for place, model in enumerate(board.models):
         values = factor * board.mse(model)
         found = interval(values)

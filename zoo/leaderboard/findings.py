@@ -119,6 +119,6 @@ def _design(board: Board, found: Sequence[Found], groups: Sequence[object]) -> s
 
 def _error(board: Board, model: str, sure: bool = False) -> str:
     found = interval(board.mse(model))
-    factor, unit = (DEG2, "deg²") if board.unit == "rad" else (1.0, f"{board.unit}²")
+    factor, unit = board.squared
     half = f" ± {factor * found.half:.2g}" if sure else ""
     return f"{factor * found.mean:.3g}{half} {unit}"

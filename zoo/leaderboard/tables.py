@@ -59,6 +59,13 @@ class Board:
         return self.units[0] if len(set(self.units)) == 1 else "mixed units"
 
     @property
+    def squared(self) -> tuple[float, str]:
+        """Factor and unit that errors are told in: deg² where the data are in rad."""
+        if self.unit == "rad":
+            return DEG2, "deg²"
+        return 1.0, f"{self.unit}²" if self.unit else "(no unit)"
+
+    @property
     def first(self) -> int:
         """Frame of the movement at which what is predicted begins."""
         return self.protocol.seen
