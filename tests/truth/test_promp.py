@@ -12,7 +12,7 @@ import torch
 
 from zoo.datasets.records import Sequences
 from zoo.dynamics.rollout import Timing
-from zoo.dynamics.weight_learning import learn, views_of
+from zoo.dynamics.weight_learning import Noise, Single, learn, similarity, views_of
 from zoo.dynamics.weights import Basis, Weights
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
@@ -40,6 +40,7 @@ def drawn(count, *, seed=0, lengths=(FRAMES,), noise=0.05, missing=0.0):
     truth.synergies, truth.offset = torch.eye(CHANNELS).double(), torch.zeros(CHANNELS).double()
     truth.units = torch.tensor([n - 1.0 for n in lengths], dtype=torch.float64)
     truth.offsets = torch.zeros_like(truth.units)
+    truth.scales = truth.information = torch.ones(1, dtype=torch.float64)
     with seeded(seed, "cpu"):
         w = truth.weights.sample(count)
         arrays = []
@@ -55,6 +56,12 @@ def drawn(count, *, seed=0, lengths=(FRAMES,), noise=0.05, missing=0.0):
 def rank_two(size):
     loading = normal(size, 2, seed=2)
     return loading @ loading.T
+
+
+def gaussian(model):
+    """The model with one scale, every entry counted whole: a Gaussian for every timing."""
+    model.scales = model.information = torch.ones(1, dtype=torch.float64)
+    return model
 
 
 def layout():
@@ -103,8 +110,8 @@ def test_log_density_is_that_of_the_dense_gaussian():
         expected = torch.distributions.MultivariateNormal(
             mean[known], (path + noise)[known][:, known]
         ).log_prob(data.values[i].flatten()[known])
-        found = view.log_density(model.weights, model.noise.square())
-        torch.testing.assert_close(found[0], expected, rtol=1e-9, atol=1e-9)
+        found = view.log_density(model.weights, Noise(model.noise.square()))
+        torch.testing.assert_close(found[0, 0], expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("synergies", [None, 2])
@@ -112,6 +119,7 @@ def test_forecast_and_filled_gaps_are_the_conditional_of_the_dense_gaussian(syne
     _, data, _ = drawn(12)
     model = ProMP(data.layout, Config(kernels=KERNELS, synergies=synergies))
     model.condition(data)
+    gaussian(model)
     seen = torch.zeros(FRAMES, CHANNELS, dtype=torch.bool)
     seen[:8] = True
     future = model.forecast(whole(data.first(8)), None, horizon=FRAMES - 8, draws=3)
@@ -140,7 +148,8 @@ def test_expectation_maximisation_never_loses():
     rows = zip(data.values, data.mask, data.lengths.tolist(), strict=True)
     inside = [(x[:n], seen[:n]) for x, seen, n in rows]
     views = views_of(model.basis, inside, [Timing(len(x) - 1.0) for x, _ in inside])
-    found = learn(views, torch.arange(15), 0.2, iterations=15, tolerance=0.0)
+    single = Single.of(views, similarity(KERNELS, circular=False))
+    found = learn(single, views, 0.2, iterations=15, tolerance=0.0)
     gains = np.diff(found.objective)
     assert len(gains) >= 5 and gains.min() > -1e-7 * abs(found.objective[-1])
 
@@ -170,7 +179,9 @@ def test_bands_cover_what_they_promise():
 
 def test_generative_program_is_the_model():
     model, data, w = drawn(3)
-    trace = poutine.trace(poutine.condition(model, data={"w": w})).get_trace(whole(data))
+    first = torch.zeros(3, dtype=torch.long)
+    given = poutine.condition(model, data={"timing": first, "scale": first, "w": w})
+    trace = poutine.trace(given).get_trace(whole(data))
     trace.compute_log_prob()
     expected = model.weights.root
     prior = torch.distributions.MultivariateNormal(model.mean, scale_tril=expected)
@@ -219,6 +230,7 @@ def test_durations_of_training_movements_are_the_timings_of_a_forecast():
     _, data, _ = drawn(20, lengths=(24, FRAMES))
     model = ProMP(data.layout, Config(kernels=KERNELS))
     model.condition(data)
+    gaussian(model)
     assert model.units.tolist() == [23.0, 29.0]
     assert model.forecast(whole(data.first(6)), None, horizon=5, draws=16).location.shape[0] == 16
     assert model.forecast(whole(data.first(24)), None, horizon=5, draws=16).location.shape[0] == 1
@@ -241,6 +253,7 @@ def test_a_single_movement_and_an_untrained_model_are_refused():
         ({"synergies": 0}, "synergies"),
         ({"period": -1.0}, "period"),
         ({"shrinkage": 1.0}, "shrinkage"),
+        ({"information": 0.0}, "information"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(settings, message):

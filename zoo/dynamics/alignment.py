@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -25,12 +26,19 @@ def align(
     The template is the least-squares path of the movements as they lie; each movement takes the
     choice whose template is nearest over the entries seen.
     """
+
+    @lru_cache(maxsize=4)
+    def all_of(frames: int) -> tuple[Tensor, Tensor]:
+        bases = [basis(frames, choice) for choice in choices]
+        return torch.stack([b.phases for b in bases]), bases[0].synergies
+
     longest = max(range(len(movements)), key=lambda i: len(movements[i][0]))
     timings, chosen = [choices[0]] * len(movements), [longest]
     for _ in range(rounds):
         pooled = [(movements[i], timings[i]) for i in chosen]
         template = _template(basis, pooled)
-        timings = [choices[_nearest(basis, x, seen, choices, template)] for x, seen in movements]
+        near = [_nearest(*all_of(len(x)), x, seen, template) for x, seen in movements]
+        timings = [choices[i] for i in near]
         chosen = list(range(len(movements)))
     return timings
 
@@ -57,8 +65,9 @@ def _template(
     return template
 
 
-def _nearest(
-    basis: BasisOf, x: Tensor, seen: Tensor, choices: Sequence[Timing], template: Tensor
-) -> int:
-    paths = torch.stack([basis(len(x), choice).path(template) for choice in choices])
-    return int(((x - paths) * seen).square().sum((1, 2)).argmin())
+def _nearest(φ: Tensor, synergies: Tensor, x: Tensor, seen: Tensor, template: Tensor) -> int:
+    """The choice that makes Σ (y² − 2xy) of the template's path y over the entries seen least."""
+    table = synergies @ template.unflatten(0, (synergies.shape[1], φ.shape[2]))
+    square = torch.einsum("tc,ck,cl->tkl", seen.to(x), table, table)
+    own = torch.einsum("htk,tkl,htl->h", φ, square, φ)
+    return int((own - 2 * torch.einsum("htk,tk->h", φ, (x * seen) @ table)).argmin())

@@ -16,12 +16,24 @@ from zoo.dynamics.rollout import Timing
 from zoo.dynamics.sums import Movements
 from zoo.dynamics.weights import Basis, Weights
 
-__all__ = ["Learned", "View", "learn", "maximise", "views_of"]
+__all__ = ["Learned", "Noise", "Single", "View", "learn", "maximise", "similarity", "views_of"]
 
 FLOOR = 1e-8
-FOLDS = 5
-LARGEST = 12
-SHARES = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9)
+REACH = 0.25
+
+
+@dataclass(frozen=True)
+class Noise:
+    """σ_c², and the part of an independent observation that every entry counts."""
+
+    variance: Float[Tensor, " channel"]
+    information: float = 1.0
+
+    @property
+    def precision(self) -> Float[Tensor, " channel"]:
+        """What an observed entry tells of the path."""
+        precision: Tensor = self.information / self.variance
+        return precision
 
 
 @dataclass(frozen=True)
@@ -33,38 +45,98 @@ class View:
     seen: Bool[Tensor, "time channel"]
     x: Float[Tensor, "sequence time channel"]
 
-    def likelihood(self, variance: Float[Tensor, " channel"]) -> tuple[Tensor, Tensor]:
-        """A and b of every movement, given σ²."""
-        return self.basis.precision(self.seen / variance), self.basis.linear(self.x / variance)
+    def likelihood(self, noise: Noise) -> tuple[Tensor, Tensor]:
+        """A and b of every movement."""
+        counts = noise.precision
+        return self.basis.precision(self.seen * counts), self.basis.linear(self.x * counts)
 
-    def log_density(self, prior: Weights, variance: Tensor) -> Float[Tensor, " sequence"]:
-        """Log p(x_seen) of every movement."""
-        square = (self.x.square() / variance).sum((1, 2))
-        volume = (self.seen * (2 * math.pi * variance).log()).sum()
-        return prior.log_evidence(*self.likelihood(variance)) - (square + volume) / 2
+    def log_density(
+        self, prior: Weights, noise: Noise, scales: Float[Tensor, " scale"] | None = None
+    ) -> Float[Tensor, "scale sequence"]:
+        """Log p(x_observed) of every movement for w ~ N(μ, s²Σ); s = 1 without ``scales``."""
+        s = self.x.new_ones(1) if scales is None else scales
+        if self.separable:
+            return self._compressed(prior, noise, s)
+        square = (self.x.square() * noise.precision).sum((1, 2))
+        volume = noise.information * (self.seen * (2 * math.pi * noise.variance).log()).sum()
+        return prior.log_evidence(*self.likelihood(noise), s) - (square + volume) / 2
 
-    def posterior(self, prior: Weights, variance: Tensor) -> Weights:
-        """p(w | x_seen) of every movement."""
-        return prior.condition(*self.likelihood(variance))
+    @property
+    def separable(self) -> bool:
+        """Whether the same frames were observed of every channel that was observed at all."""
+        frames, channels = self.seen.any(1), self.seen.any(0)
+        return bool((self.seen == frames[:, None] & channels).all())
 
-    def begun(self) -> View:
-        """The same movements of which only the first quarter is seen."""
-        early = torch.arange(len(self.seen))[:, None] < max(2, len(self.seen) // 4)
-        return View(self.rows, self.basis, self.seen & early, self.x * early)
+    def _compressed(self, prior: Weights, noise: Noise, scales: Tensor) -> Tensor:
+        """The same density by the part of x that w explains: φ = QR of the frames observed."""
+        frames, channels = self.seen.any(1), self.seen.any(0)
+        deviation = noise.precision[channels].sqrt()
+        q, r = torch.linalg.qr(self.basis.phases[frames])
+        inner = Basis(r, self.basis.synergies[channels] * deviation[:, None])
+        x = self.x[:, frames][..., channels] * deviation
+        z = q.mT @ x
+        rest = x.square().sum((1, 2)) - z.square().sum((1, 2))
+        error = (z - inner.path(prior.mean)).flatten(1)
+        half = inner.path(prior.covariance).flatten(-2)
+        cover = inner.path(half.mT).flatten(-2)
+        square, volume = _gaussian(cover, error, scales)
+        entries = noise.information * (2 * math.pi * noise.variance[channels]).log().sum()
+        density: Tensor = -(square + rest + volume[:, None] + len(q) * entries) / 2
+        return density
+
+    def posterior(self, prior: Weights, noise: Noise) -> Weights:
+        """p(w | x_observed) of every movement."""
+        return prior.condition(*self.likelihood(noise))
 
     def only(self, here: Bool[Tensor, " sequence"]) -> View:
         """Those of its movements that are ``here``."""
         return View(self.rows[here], self.basis, self.seen, self.x[here])
 
 
+def _gaussian(cover: Tensor, error: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """eᵀ(I + s²C)⁻¹e of every error, and log |I + s²C|, for every scale s."""
+    eye = torch.eye(len(cover), dtype=cover.dtype, device=cover.device)
+    root = torch.linalg.cholesky(eye + scales[:, None, None].square() * cover)
+    white = torch.linalg.solve_triangular(root, error.mT.expand(len(scales), -1, -1), upper=False)
+    volume = 2 * root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return white.square().sum(1), volume
+
+
 @dataclass(frozen=True)
 class Learned:
-    """p(w), σ², the share of the prior, and the objective after every iteration."""
+    """p(w), σ², and the objective after every iteration."""
 
     weights: Weights
     variance: Float[Tensor, " channel"]
-    shrinkage: float
     objective: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Single:
+    """Weights of every movement alone, shrunk a little towards those of all, with σ² and Σ₀."""
+
+    weights: Weights
+    variance: Float[Tensor, " channel"]
+    target: Float[Tensor, "weight weight"]
+
+    @classmethod
+    def of(cls, views: Sequence[View], alike: Float[Tensor, "kernel kernel"]) -> Single:
+        """Every movement for itself; ``alike`` is the correlation of neighbouring kernels."""
+        size = views[0].x.new_ones(views[0].x.shape[-1])
+        prior = Weights(*_pooled(views, Noise(size)))
+        found = _expect(views, prior, Noise(1e-2 * size))
+        count = torch.as_tensor(sum(len(v.rows) * v.seen.sum(0) for v in views)).clamp(min=1)
+        spread = found.covariance / len(found.mean) + FLOOR * torch.eye(len(prior.mean))
+        weights = Weights(found.mean, torch.linalg.cholesky(spread))
+        variance = (found.energy / count).clamp_min(FLOOR)
+        return cls(weights, variance, _target(found.mean, alike))
+
+    def population(self, share: float) -> Weights:
+        """N(μ, Σ) of the movements, of which Σ₀ has that ``share``."""
+        mean = self.weights.mean.mean(0)
+        deviation = self.weights.mean - mean
+        sample = deviation.mT @ deviation / len(deviation) + self.weights.covariance
+        return Weights(mean, torch.linalg.cholesky((1 - share) * sample + share * self.target))
 
 
 @dataclass(frozen=True)
@@ -89,27 +161,31 @@ def views_of(basis: BasisOf, movements: Movements, timings: Sequence[Timing]) ->
     return found
 
 
-def learn(
-    views: Sequence[View],
-    group: Int[Tensor, " sequence"],
-    shrinkage: float | None,
-    *,
-    iterations: int,
-    tolerance: float,
-) -> Learned:
-    """p(w) and σ² of several movements.
+def similarity(kernels: int, *, circular: bool) -> Float[Tensor, "kernel kernel"]:
+    """Correlation of the weights of two kernels under the prior, e to the minus their distance.
 
-    Every movement gets weights of its own first. Their spread, pooled to one shape with a size for
-    every synergy, is the scale Σ₀ of an inverse-Wishart prior that counts as much as
-    ``shrinkage`` of all evidence on Σ; None takes the share under which groups of movements left
-    out are most probable after their first quarter.
+    It falls to 1/e over a quarter of the kernels, on a circle where they are ``circular``.
+
+    >>> similarity(4, circular=True)[0].log().round(decimals=3).tolist()
+    [0.0, -1.0, -2.0, -1.0]
     """
-    single, variance = _single(views)
-    target = _target(single.mean, views[0].basis)
-    share = _share(single, views, group, target, variance) if shrinkage is None else shrinkage
-    start = _population(single, target, share)
-    strength = len(single.mean) * share / (1 - share)
-    return maximise(views, start, variance, target, strength, iterations, tolerance)
+    order = torch.arange(kernels, dtype=torch.float64)
+    apart = (order[:, None] - order).abs()
+    apart = torch.minimum(apart, kernels - apart) if circular else apart
+    return torch.exp(-apart / (REACH * kernels))
+
+
+def learn(
+    single: Single, views: Sequence[View], share: float, *, iterations: int, tolerance: float
+) -> Learned:
+    """p(w) and σ² of several movements, whose own weights are known.
+
+    Σ₀ is the scale of an inverse-Wishart prior that counts as much as ``share`` of all evidence on
+    Σ; see :func:`maximise`.
+    """
+    strength = len(single.weights.mean) * share / (1 - share)
+    start = single.population(share)
+    return maximise(views, start, single.variance, single.target, strength, iterations, tolerance)
 
 
 def maximise(
@@ -129,7 +205,7 @@ def maximise(
     entries, objective = float(torch.as_tensor(count).sum()), list[float]()
     movements = sum(len(v.rows) for v in views)
     for _ in range(iterations):
-        found = _expect(views, weights, variance)
+        found = _expect(views, weights, Noise(variance))
         objective.append(float(found.log_density - _penalty(weights, target, strength)))
         if len(objective) > 1 and objective[-1] - objective[-2] < tolerance * entries:
             break
@@ -138,23 +214,22 @@ def maximise(
         total = found.covariance + scatter + strength * target
         weights = Weights(mean, torch.linalg.cholesky(total / (movements + strength)))
         variance = (found.energy / torch.as_tensor(count).clamp(min=1)).clamp_min(FLOOR)
-    share = strength / (movements + strength)
-    return Learned(weights, variance, share, tuple(objective))
+    return Learned(weights, variance, tuple(objective))
 
 
-def _expect(views: Sequence[View], prior: Weights, variance: Tensor) -> _Expected:
+def _expect(views: Sequence[View], prior: Weights, noise: Noise) -> _Expected:
     movements = sum(len(v.rows) for v in views)
     mean = prior.mean.new_zeros(movements, prior.mean.shape[-1])
-    covariance, energy = torch.zeros_like(prior.root), torch.zeros_like(variance)
-    log_density = variance.new_zeros(())
+    covariance, energy = torch.zeros_like(prior.root), torch.zeros_like(noise.variance)
+    log_density = noise.variance.new_zeros(())
     for view in views:
-        posterior = view.posterior(prior, variance)
+        posterior = view.posterior(prior, noise)
         path, spread = posterior.moments(view.basis)
         mean[view.rows] = posterior.mean
         covariance = covariance + len(view.rows) * posterior.covariance
         error = (view.x - path * view.seen).square().sum((0, 1))
         energy = energy + error + len(view.rows) * (spread * view.seen).sum(0)
-        log_density = log_density + view.log_density(prior, variance).sum()
+        log_density = log_density + view.log_density(prior, noise).sum()
     return _Expected(mean, covariance, energy, log_density)
 
 
@@ -163,64 +238,17 @@ def _penalty(weights: Weights, target: Tensor, strength: float) -> Tensor:
     return strength * (weights.root.diagonal().log().sum() + trace / 2)
 
 
-def _single(views: Sequence[View]) -> tuple[Weights, Tensor]:
-    """Weights of every movement alone, shrunk a little towards those of all, and σ²."""
-    size = views[0].x.new_ones(views[0].x.shape[-1])
-    parts = [view.likelihood(size) for view in views]
+def _pooled(views: Sequence[View], noise: Noise) -> tuple[Tensor, Tensor]:
+    """Least-squares weights of all movements together, and I as the spread about them."""
+    parts = [view.likelihood(noise) for view in views]
     total = torch.stack([len(v.rows) * a for v, (a, _) in zip(views, parts, strict=True)]).sum(0)
-    ridge = 1e-6 * total.diagonal().mean() * torch.eye(len(total), dtype=total.dtype)
+    eye = torch.eye(len(total), dtype=total.dtype)
     linear = torch.stack([b.sum(0) for _, b in parts]).sum(0)
-    mean = torch.linalg.solve(total + ridge, linear)
-    prior = Weights(mean, torch.eye(len(total), dtype=total.dtype))
-    found = _expect(views, prior, 1e-2 * size)
-    count = torch.as_tensor(sum(len(v.rows) * v.seen.sum(0) for v in views)).clamp(min=1)
-    root = torch.linalg.cholesky(found.covariance / len(found.mean) + FLOOR * torch.eye(len(mean)))
-    return Weights(found.mean, root), (found.energy / count).clamp_min(FLOOR)
+    return torch.linalg.solve(total + 1e-6 * total.diagonal().mean() * eye, linear), eye
 
 
-def _target(w: Float[Tensor, "sequence weight"], basis: Basis) -> Float[Tensor, "weight weight"]:
-    """Σ₀: synergies are independent, of one shape over kernels and an own size each."""
-    kernels = basis.phases.shape[1]
-    deviation = (w - w.mean(0)).unflatten(1, (-1, kernels))
-    size = deviation.square().sum((0, 2)).clamp_min(FLOOR)
-    scaled = deviation / size.sqrt()[:, None]
-    shape = torch.einsum("ijk,ijl->kl", scaled, scaled) / len(size)
-    shape = shape + 1e-4 * shape.diagonal().mean() * torch.eye(kernels, dtype=w.dtype)
-    return torch.kron((size / len(w)).diag(), shape)
-
-
-def _population(single: Weights, target: Tensor, share: float) -> Weights:
-    mean = single.mean.mean(0)
-    deviation = single.mean - mean
-    sample = deviation.mT @ deviation / len(deviation) + single.covariance
-    return Weights(mean, torch.linalg.cholesky((1 - share) * sample + share * target))
-
-
-def _share(
-    single: Weights, views: Sequence[View], group: Tensor, target: Tensor, variance: Tensor
-) -> float:
-    """The share of the prior that best foretells groups left out; 0.5 of fewer than three."""
-    if len(group.unique()) < 3:
-        return 0.5
-    largest = sorted(views, key=lambda v: -len(v.rows))[:LARGEST]
-    return max(SHARES, key=lambda s: _foretold(s, single, largest, group, target, variance))
-
-
-def _foretold(
-    share: float,
-    single: Weights,
-    views: Sequence[View],
-    group: Tensor,
-    target: Tensor,
-    variance: Tensor,
-) -> float:
-    """Log density of the later three quarters of movements left out, given their first."""
-    score, fold = 0.0, group % FOLDS
-    for left in fold.unique():
-        out = fold == left
-        population = _population(Weights(single.mean[~out], single.root), target, share)
-        for view in (v.only(out[v.rows]) for v in views):
-            if len(view.rows):
-                score += float(view.log_density(population, variance).sum())
-                score -= float(view.begun().log_density(population, variance).sum())
-    return score
+def _target(w: Float[Tensor, "sequence weight"], alike: Tensor) -> Float[Tensor, "weight weight"]:
+    """Σ₀: synergies are independent, each of its own size; neighbouring kernels go together."""
+    deviation = (w - w.mean(0)).unflatten(1, (-1, len(alike)))
+    size = deviation.square().sum((0, 2)) / ((len(w) - 1) * len(alike))
+    return torch.kron(size.clamp_min(FLOOR).diag(), alike)

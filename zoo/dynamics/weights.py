@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -25,7 +26,7 @@ __all__ = ["Basis", "Weights", "superposed"]
 class Basis:
     """φ of every frame and the synergies S, by which the weights act on the channels."""
 
-    phases: Float[Tensor, "time kernel"]
+    phases: Float[Tensor, "*batch time kernel"]
     synergies: Float[Tensor, "channel synergy"]
 
     def path(self, w: Float[Tensor, "*batch weight"]) -> Float[Tensor, "*batch time channel"]:
@@ -35,7 +36,7 @@ class Basis:
         tensor([[ 0.,  1.,  5.],
                 [ 0.,  2., 10.]])
         """
-        table = w.unflatten(-1, (self.synergies.shape[1], self.phases.shape[1]))
+        table = w.unflatten(-1, (self.synergies.shape[1], self.phases.shape[-1]))
         y: Tensor = (self.synergies @ table @ self.phases.mT).mT
         return y
 
@@ -62,11 +63,21 @@ class Weights:
     mean: Float[Tensor, "*sequence weight"]
     root: Float[Tensor, "weight rank"]
 
-    @property
+    @cached_property
     def covariance(self) -> Float[Tensor, "weight weight"]:
         """Σ."""
         covariance: Tensor = self.root @ self.root.mT
         return covariance
+
+    @property
+    def lower(self) -> Float[Tensor, "weight weight"]:
+        """Lower-triangular factor of Σ."""
+        turned: Tensor = torch.linalg.qr(self.root.mT, mode="r").R.mT
+        return turned * turned.diagonal().sign()
+
+    def scaled(self, scale: float | Tensor) -> Weights:
+        """The same mean with ``scale`` times the standard deviations."""
+        return Weights(self.mean, scale * self.root)
 
     def condition(
         self, precision: Float[Tensor, "weight weight"], linear: Float[Tensor, "sequence weight"]
@@ -77,15 +88,19 @@ class Weights:
         return Weights(self.mean + (error @ root) @ root.mT, root)
 
     def log_evidence(
-        self, precision: Float[Tensor, "weight weight"], linear: Float[Tensor, "sequence weight"]
-    ) -> Float[Tensor, " sequence"]:
-        """Log of the likelihood, integrated over w."""
-        inner = self._inner(precision)
+        self,
+        precision: Float[Tensor, "weight weight"],
+        linear: Float[Tensor, "sequence weight"],
+        scales: Float[Tensor, " scale"],
+    ) -> Float[Tensor, "scale sequence"]:
+        """Log of the likelihood, integrated over w ~ N(μ, s²Σ), for every scale s."""
+        inner = self._inner(precision, scales[:, None, None])
         error = linear - self.mean @ precision
         at_mean = (self.mean * (linear + error)).sum(-1) / 2
-        white = torch.linalg.solve_triangular(inner, (error @ self.root).mT, upper=False)
-        volume = inner.diagonal().log().sum()
-        evidence: Tensor = at_mean + white.square().sum(0) / 2 - volume
+        pull = scales[:, None, None] * (error @ self.root).mT
+        white = torch.linalg.solve_triangular(inner, pull, upper=False)
+        volume = inner.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        evidence: Tensor = at_mean + white.square().sum(1) / 2 - volume[:, None]
         return evidence
 
     def affine(self, matrix: Float[Tensor, "weight weight"], shift: Tensor) -> Weights:
@@ -115,7 +130,12 @@ class Weights:
         self, basis: Basis
     ) -> tuple[Float[Tensor, "*sequence time channel"], Float[Tensor, "time channel"]]:
         """Mean of y, and its variance."""
-        return basis.path(self.mean), basis.path(self.root.mT).square().sum(0)
+        s, φ = basis.synergies, basis.phases
+        cover = self.covariance.view(s.shape[1], φ.shape[1], s.shape[1], φ.shape[1])
+        half = torch.einsum("cj,jkil->ckil", s, cover)
+        each = torch.einsum("ckil,ci->ckl", half, s)
+        variance = torch.einsum("ctk,tk->tc", φ @ each, φ).clamp_min(0)
+        return basis.path(self.mean), variance
 
     def sample(self, count: int) -> Float[Tensor, "sample *sequence weight"]:
         """Draws of w, from torch's default generator."""
@@ -123,10 +143,11 @@ class Weights:
         ε = torch.randn(shape, dtype=self.mean.dtype, device=self.mean.device)
         return self.mean + ε @ self.root.mT
 
-    def _inner(self, precision: Tensor) -> Tensor:
-        """Cholesky factor of I + rootᵀ A root."""
+    def _inner(self, precision: Tensor, scale: float | Tensor = 1.0) -> Tensor:
+        """Cholesky factor of I + s² rootᵀ A root."""
         eye = torch.eye(self.root.shape[-1], dtype=self.root.dtype, device=self.root.device)
-        factor: Tensor = torch.linalg.cholesky(eye + self.root.mT @ precision @ self.root)
+        gram = self.root.mT @ precision @ self.root
+        factor: Tensor = torch.linalg.cholesky(eye + scale * scale * gram)
         return factor
 
     def _posterior_root(self, inner: Tensor) -> Tensor:

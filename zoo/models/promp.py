@@ -2,35 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Literal
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
+from pyro import poutine
 from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.dynamics.alignment import align, durations
-from zoo.dynamics.components import Components, Paths, alike, ramp, resample
+from zoo.dynamics.components import Components, Paths, ramp
+from zoo.dynamics.cross_fitting import Choice, Prepared, choose, inflation
 from zoo.dynamics.dmp import discrete_basis, rhythmic_basis
+from zoo.dynamics.hypotheses import Hypotheses, Posteriors
 from zoo.dynamics.rollout import Timing
+from zoo.dynamics.scales import student_scales
 from zoo.dynamics.sums import Movements
 from zoo.dynamics.synergies import synergies_of
 from zoo.dynamics.timing import FINE, expected, period_of, phases
-from zoo.dynamics.weight_learning import View, learn, views_of
+from zoo.dynamics.weight_learning import Noise, Single, learn, similarity, views_of
 from zoo.dynamics.weights import Basis, Weights, superposed
 from zoo.models.baseline import check_fitted, movement_groups, movements_of, seen_entries
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior
+from zoo.types import Batch, Layout, Posterior, Sites
 
 __all__ = ["Config", "ProMP"]
 
 COMPONENTS = 16
 TEMPOS, PHASES = 9, 32
+SCALES = {"discrete": 16, "rhythmic": 4}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +46,10 @@ class Config:
     ``kernels`` basis functions for every synergy; ``synergies`` is their number, and every channel
     is its own where that is None or not below the number of channels. ``period`` of rhythmic
     movements is in s; None finds it by autocorrelation.
-    ``shrinkage`` is the share of the inverse-Wishart prior in Σ; None chooses it by the density of
-    movements left out. EM ends after ``em_iterations`` or a gain of ``em_tolerance`` nats an entry.
+    ``shrinkage`` is the share of the inverse-Wishart prior in Σ; ``information`` is the part of an
+    independent observation that every entry counts, 1 for Bayes' rule. None chooses them by the
+    density of movements left out. EM ends after ``em_iterations`` or a gain of ``em_tolerance``
+    nats an entry.
     """
 
     kind: Literal["discrete", "rhythmic"] = "discrete"
@@ -49,6 +57,7 @@ class Config:
     synergies: int | None = None
     period: float | None = None
     shrinkage: float | None = None
+    information: float | None = None
     em_iterations: int = 20
     em_tolerance: float = 1e-4
 
@@ -66,32 +75,46 @@ class Config:
                 raise ValueError(f"{name} must be positive; got {value}")
         if self.shrinkage is not None and not 0 < self.shrinkage < 1:
             raise ValueError(f"shrinkage must be between 0 and 1; got {self.shrinkage}")
+        if self.information is not None and not 0 < self.information <= 1:
+            raise ValueError(f"information must be above 0, at most 1; got {self.information}")
 
 
 class ProMP(nn.Module):
     r"""A whole movement is a Gaussian vector of basis weights, correlated over all channels.
 
-    w ~ N(μ, Σ),   y_tc = m_c + Σ_jk S_cj φ_k(t) w_jk,   x_tc ~ N(y_tc, σ_c²)
+    timing ~ U,   s² ~ ν/χ²_ν,   w ~ N(μ, s²Σ)
+
+    y_tc = m_c + Σ_jk S_cj φ_k(t) w_jk,   x_tc ~ N(y_tc, σ_c²)
 
     Paraschos et al., *Probabilistic movement primitives*, NIPS 2013, and Autonomous Robots 42
-    (2018). μ, Σ and σ by EM under an inverse-Wishart prior whose scale is of independent channels,
-    as Gómez-González et al., *Using probabilistic movement primitives for striking movements*
-    (2016); its weight is the one under which movements left out are foretold best, windows of one
-    movement left out together. With ``synergies``, S and m are principal components of the frames:
-    Colomé & Torras, *Dimensionality reduction for probabilistic movement primitives* (2014). The
-    rival that chapters 5 and 6 of the thesis name; not one of its own models.
+    (2018). μ, Σ and σ are point estimates, by EM under an inverse-Wishart prior whose scale has
+    independent channels, as Gómez-González et al., *Using probabilistic movement primitives for
+    striking movements* (2016); there, neighbouring kernels go together. Under that prior w of a new
+    movement is a t: of n − 1 degrees of freedom here, as an equal mixture of 16 scales s (4 where
+    movements repeat), with a further (1 + 1/n)/(1 − 1/n) in Σ for the mean of n movements. With
+    ``synergies``, S and m are principal components of the frames: Colomé & Torras, *Dimensionality
+    reduction for probabilistic movement primitives* (2014). The rival that chapters 5 and 6 of the
+    thesis name; not one of its own models.
 
-    Forecast, filled gaps and reconstruction are the exact Gaussian given the entries seen and the
-    timing; where training movements differ in duration, and for rhythmic movements in tempo and
-    phase, a mixture over these timings. Another goal moves a demonstration along Σ, its first frame
-    kept: the nearest weights that end there (rhythmic: about another centre). Another duration
-    stretches the phase; switching blends two paths linearly, so that joint draws exist, instead of
-    Paraschos' product of densities.
-    ``epistemic`` is the spread of the path, ``noise`` that of the observation.
+    ``timing`` is the whole movement's duration; of rhythmic movements one of 288 tempos and phases.
+    The guide is the exact posterior of timing, s and w in this program. The program counts every
+    entry as ``information`` of an independent one, since residuals go together over channels and
+    time: below 1 its posterior is a generalised one, not Bayes' (Bissiri, Holmes & Walker, *A
+    general framework for updating belief distributions*, JRSS B 78, 2016). Share of the prior and
+    information are those under which movements left out are most probable after their first
+    quarter, alignment, synergies, mean and noise made without them; windows of one movement are
+    left out together. Data are standardised before, all training movements together.
+
+    Forecasts and filled gaps are the posterior predictive, at durations of training movements that
+    last as long, resampled to 16 components. A reconstruction, and a demonstration that is to be
+    changed, count every entry whole, at the likeliest timing. Another goal moves a demonstration
+    along Σ, its first frame kept: the nearest weights that end there (rhythmic: about another
+    centre). Another duration stretches the phase; switching blends two paths linearly, so that
+    joint draws exist, instead of Paraschos' product of densities.
+    ``epistemic`` is the uncertainty of the path, ``noise`` that of the observation.
 
     It cannot leave the span of its basis, learn from one movement, or reach a goal beyond its
-    synergies. Σ has a further (1 + 1/n)/(1 − 1/n) for the estimated mean of n movements; its other
-    uncertainty is not in the bands. Defaults: 15 kernels, no synergies; data standardised.
+    synergies. Defaults: 15 kernels, no synergies; data standardised.
     """
 
     config_class: ClassVar[type] = Config
@@ -102,6 +125,8 @@ class ProMP(nn.Module):
     synergies: Tensor
     offset: Tensor
     shrinkage: Tensor
+    information: Tensor
+    scales: Tensor
     units: Tensor
     offsets: Tensor
 
@@ -110,8 +135,8 @@ class ProMP(nn.Module):
         super().__init__()
         self.phased = config.kind == "discrete"
         self.layout, self.config = layout, config
-        names = ("mean", "root", "noise", "synergies", "offset", "shrinkage", "units", "offsets")
-        for name in names:
+        moments = ("mean", "root", "noise", "synergies", "offset")
+        for name in (*moments, "shrinkage", "information", "scales", "units", "offsets"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
 
     @property
@@ -125,45 +150,55 @@ class ProMP(nn.Module):
         movements = movements_of("promp", data, self.dtype)
         if len(movements) < 2:
             raise ValueError("promp needs at least 2 movements for their spread; got 1")
-        self.synergies, self.offset = synergies_of(
-            movements.values, movements.mask, self.config.synergies
-        )
         rows = zip(movements.values, movements.mask, movements.lengths.tolist(), strict=True)
-        inside = [(((x - self.offset) * seen)[:n], seen[:n]) for x, seen, n in rows]
-        choices = self._choices(inside, movements.rate)
-        rhythmic = self.config.kind == "rhythmic"
-        timings = align(self.basis, inside, choices) if rhythmic else choices
-        self._keep(views_of(self.basis, inside, timings), movement_groups(movements))
-        kept = expected(timings, TEMPOS, PHASES) if rhythmic else durations(timings, COMPONENTS)
-        self.units = self.mean.new_tensor([t.unit for t in kept])
-        self.offsets = self.mean.new_tensor([t.offset for t in kept])
+        inside = [(x[:n], seen[:n]) for x, seen, n in rows]
+        prepare = partial(self._prepared, inside, movements.rate)
+        group, c = movement_groups(movements), self.config
+        chosen = choose(prepare, inside, group, c.shrinkage, c.information)
+        self._keep(prepare(range(len(inside))), chosen, len(group.unique()))
 
-    def forward(self, batch: Batch) -> Float[Tensor, "sequence frame channel"]:
+    def forward(self, batch: Batch) -> Float[Tensor, "*sample sequence frame channel"]:
         """The generative program of the whole movements of ``batch``."""
-        frames = batch.movements.shape[1]
-        prior, basis = self.weights, self.basis(frames, self._whole(frames)[0])
-        rows = torch.arange(len(batch.movements))
+        given = self._given(self._whole(batch.movements.shape[1]))
+        bases = [given.basis(batch.movements.shape[1], t) for t in given.timings]
+        phases, prior = torch.stack([b.phases for b in bases]), given.prior
+        rows, like = torch.arange(len(batch.movements)), torch.ones_like
         with pyro.plate("movements", size=batch.total_sequences, subsample=rows):
-            w = pyro.sample("w", dist.MultivariateNormal(prior.mean, scale_tril=prior.root))
-            y: Tensor = self.offset + basis.path(w)
+            timing = pyro.sample("timing", dist.Categorical(like(phases[:, 0, 0])))
+            scale = pyro.sample("scale", dist.Categorical(like(given.scales)))
+            root = given.scales[scale][..., None, None] * prior.root
+            w = pyro.sample("w", dist.MultivariateNormal(prior.mean, scale_tril=root))
+            y: Tensor = self.offset + Basis(phases[timing], self.synergies).path(w)
             noise = dist.Normal(y, self.noise)
             if batch.movement_mask is not None:
                 noise = noise.mask(batch.movement_mask)
-            pyro.sample("x", noise.to_event(2), obs=batch.movements)
+            with poutine.scale(scale=given.noise.information):
+                pyro.sample("x", noise.to_event(2), obs=batch.given(batch.movements))
         return y
+
+    def posterior_sites(self, batch: Batch) -> Sites:
+        """The exact posterior of timing, scale and weights given the movements of ``batch``."""
+        found, size = self._posteriors(batch), batch.total_sequences
+        of = {"timing": found.timing, "scale": found.scale, "w": found.weights}
+        return Sites(plate="movements", size=size, rows=len(batch.movements), of=of)
+
+    def log_evidence(self, batch: Batch) -> Float[Tensor, ""]:
+        """Log p(x) of the entries observed, summed over the movements of ``batch``."""
+        return self._posteriors(batch).log_evidence().sum()
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Paths of the weights that the movements have, at their likeliest timing."""
         check_fitted("promp", self.mean)
-        timings = self._whole(batch.values.shape[1])
-        return self._filled(batch.values, seen_entries(batch), timings, 1, draws)
+        given = self._given(self._whole(batch.values.shape[1]), whole=True)
+        parts = given.filled(batch.values - self.offset, seen_entries(batch), 1)
+        return self._as_predictive(parts, draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """The paths given the entries seen."""
+        """The paths given the entries observed."""
         check_fitted("promp", self.mean)
-        timings = self._whole(batch.values.shape[1])
-        count = 1 if len(timings) == 1 else COMPONENTS
-        return self._filled(batch.values, seen_entries(batch), timings, count, draws)
+        given = self._given(self._whole(batch.values.shape[1]))
+        parts = given.filled(batch.values - self.offset, seen_entries(batch), COMPONENTS)
+        return self._as_predictive(parts, draws)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -171,10 +206,10 @@ class ProMP(nn.Module):
         """The paths given their first frames, after these."""
         check_fitted("promp", self.mean)
         pad, known = (0, 0, 0, horizon), batch.values.shape[1]
-        values, seen = functional.pad(batch.values, pad), functional.pad(seen_entries(batch), pad)
-        timings = self._timings(known)
-        count = 1 if len(timings) == 1 else COMPONENTS
-        return self._filled(values, seen, timings, count, draws, after=known)
+        x = functional.pad(batch.values - self.offset, pad)
+        seen = functional.pad(seen_entries(batch), pad)
+        parts = self._given(self._timings(known)).filled(x, seen, COMPONENTS)
+        return self._as_predictive(parts.after(known), draws)
 
     def generate(
         self,
@@ -214,12 +249,21 @@ class ProMP(nn.Module):
 
     def basis(self, frames: int, timing: Timing) -> Basis:
         """φ and S of ``frames`` frames."""
-        time, kernels = torch.arange(frames, dtype=self.dtype), self.config.kernels
-        if self.config.kind == "discrete":
-            φ = discrete_basis(time, kernels=kernels, duration=timing.unit)
-        else:
-            φ = rhythmic_basis(time, kernels=kernels, period=timing.unit, offset=timing.offset)
-        return Basis(φ, self.synergies)
+        return _basis(self.config, self.synergies, frames, timing)
+
+    def _prepared(self, movements: Movements, rate: float | None, rows: Sequence[int]) -> Prepared:
+        """Some of the movements, with all that is learned before Σ."""
+        some, rhythmic = [movements[i] for i in rows], self.config.kind == "rhythmic"
+        values, mask = (torch.cat([m[j] for m in some])[None] for j in (0, 1))
+        synergies, offset = synergies_of(values, mask, self.config.synergies)
+        basis = partial(_basis, self.config, synergies)
+        inside = [((x - offset) * seen, seen) for x, seen in some]
+        choices = self._choices(inside, rate)
+        timings = align(basis, inside, choices) if rhythmic else choices
+        views = views_of(basis, inside, timings)
+        single = Single.of(views, similarity(self.config.kernels, circular=rhythmic))
+        kept = expected(timings, TEMPOS, PHASES) if rhythmic else durations(timings, COMPONENTS)
+        return Prepared(basis, synergies, offset, views, single, kept)
 
     def _choices(self, movements: Movements, rate: float | None) -> list[Timing]:
         """Durations of discrete movements; all tempos and phases of rhythmic ones."""
@@ -229,64 +273,45 @@ class ProMP(nn.Module):
         middle = period_of(movements) if period is None else period * (rate or 1.0)
         return phases(middle, FINE, PHASES)
 
-    def _keep(self, views: list[View], group: Tensor) -> None:
-        c, n = self.config, max(2, len(group.unique()))
+    def _keep(self, all_: Prepared, chosen: Choice, groups: int) -> None:
+        c = self.config
         found = learn(
-            views, group, c.shrinkage, iterations=c.em_iterations, tolerance=c.em_tolerance
+            all_.single,
+            all_.views,
+            chosen.share,
+            iterations=c.em_iterations,
+            tolerance=c.em_tolerance,
         )
+        self.synergies, self.offset = all_.synergies, all_.offset
         self.mean, self.noise = found.weights.mean, found.variance.sqrt()
-        self.root = found.weights.root * ((n + 1) / (n - 1)) ** 0.5
-        self.shrinkage = self.mean.new_tensor(found.shrinkage)
+        self.root = found.weights.root * inflation(groups)
+        self.scales = student_scales(max(1, groups - 1), SCALES[c.kind])
+        self.shrinkage = self.mean.new_tensor(chosen.share)
+        self.information = self.mean.new_tensor(chosen.information)
+        self.units = self.mean.new_tensor([t.unit for t in all_.expected])
+        self.offsets = self.mean.new_tensor([t.offset for t in all_.expected])
 
-    def _filled(
-        self,
-        values: Tensor,
-        seen: Tensor,
-        timings: list[Timing],
-        count: int,
-        draws: int,
-        *,
-        after: int = 0,
-    ) -> Predictive:
-        """A mixture over timings, resampled to ``count`` components (1: the likeliest timing).
+    def _given(self, timings: list[Timing], *, whole: bool = False) -> Hypotheses:
+        """What is possible before an entry was observed; ``whole`` entries count 1."""
+        noise = Noise(self.noise.square(), 1.0 if whole else float(self.information))
+        return Hypotheses(self.weights, noise, self.basis, timings, self.scales)
 
-        Residuals of channels go together, so that all channels count as one: evidence a channel.
-        """
-        parts = Components.empty(count, values)
-        for views in self._sights(values, seen, timings):
-            for i, some, chosen in self._chosen(views, count):
-                view, whole = views[i].only(some), torch.ones(len(views[i].seen), dtype=self.dtype)
-                posterior = view.posterior(self.weights, self.noise.square())
-                parts.put(view.rows, chosen, superposed([(view.basis, posterior, whole)]))
-        return self._as_predictive(parts.after(after), draws)
-
-    def _sights(self, values: Tensor, seen: Tensor, timings: list[Timing]) -> Iterator[list[View]]:
-        """Movements with the same entries seen, in the light of every timing."""
-        for rows, mask in alike(seen):
-            x = (values[rows] - self.offset) * mask
-            yield [View(rows, self.basis(len(mask), t), mask, x) for t in timings]
-
-    def _chosen(self, views: list[View], count: int) -> list[tuple[int, Tensor, Tensor]]:
-        """Timings that are components, the movements that have them, and as which components."""
-        evidence = views[0].x.new_zeros(1, len(views[0].rows))
-        if len(views) > 1:
-            variance = self.noise.square()
-            evidence = torch.stack([v.log_density(self.weights, variance) for v in views])
-        picks = resample(evidence / len(self.noise), count)
-        rows = [(i, (picks == i).any(0)) for i in picks.unique().tolist()]
-        return [(i, some, picks[:, some] == i) for i, some in rows]
+    def _posteriors(self, batch: Batch) -> Posteriors:
+        mask, x = batch.movement_mask, batch.movements
+        seen = torch.ones_like(x, dtype=torch.bool) if mask is None else mask
+        return Posteriors(self._given(self._whole(x.shape[1])), x - self.offset, seen)
 
     def _demonstrated(self, batch: Batch, count: int) -> list[tuple[Timing, Weights]]:
         """The likeliest timing of every movement and the posterior of its weights."""
         if len(batch) not in (1, count):
             raise ValueError(f"onto has {len(batch)} movements; 1 or {count} are needed")
-        timings, found = self._whole(batch.values.shape[1]), dict[int, tuple[Timing, Weights]]()
-        for views in self._sights(batch.values, seen_entries(batch), timings):
-            for i, some, _ in self._chosen(views, 1):
-                view = views[i].only(some)
-                posterior = view.posterior(self.weights, self.noise.square())
-                for row, mean in zip(view.rows.tolist(), posterior.mean, strict=True):
-                    found[row] = (timings[i], Weights(mean[None], posterior.root))
+        given = self._given(self._whole(batch.values.shape[1]), whole=True)
+        found = dict[int, tuple[Timing, Weights]]()
+        for views in given.sights(batch.values - self.offset, seen_entries(batch)):
+            for i, view, scale, _ in given.chosen(views, 1):
+                weights = given.posterior(view, scale)
+                for row, mean in zip(view.rows.tolist(), weights.mean, strict=True):
+                    found[row] = (given.timings[i], Weights(mean[None], weights.root))
         return [found[i if len(batch) == count else 0] for i in range(count)]
 
     def _moved(self, weights: Weights, basis: Basis, goal: Tensor) -> Weights:
@@ -315,3 +340,12 @@ class ProMP(nn.Module):
             epistemic=parts.variance.sqrt(),
             draws=paths.map(lambda y: self.offset + y, paths.shape),
         )
+
+
+def _basis(config: Config, synergies: Tensor, frames: int, timing: Timing) -> Basis:
+    time, kernels = torch.arange(frames, dtype=synergies.dtype), config.kernels
+    if config.kind == "discrete":
+        φ = discrete_basis(time, kernels=kernels, duration=timing.unit)
+    else:
+        φ = rhythmic_basis(time, kernels=kernels, period=timing.unit, offset=timing.offset)
+    return Basis(φ, synergies)
