@@ -31,7 +31,7 @@ class Svi:
     ``patience`` validations without progress end the training and the best state is restored.
     ``max_steps`` bounds the work on large data: see :meth:`budgeted`. ``kept_out`` is the share of
     the movements' groups that the networks are not trained on where there is no validation part
-    and there are at least 10 groups: a model that learns its noise from new movements needs them.
+    and there are at least 8 groups: a model that learns its noise from new movements needs them.
     """
 
     epochs: int = 500

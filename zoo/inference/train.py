@@ -27,10 +27,11 @@ __all__ = [
     "MaximisesEvidence",
     "Prepares",
     "Session",
+    "kept_out",
     "train_model",
 ]
 
-ENOUGH = 10
+ENOUGH = 8
 
 
 @runtime_checkable
@@ -128,7 +129,7 @@ def train_model(
     that learns its noise so (:class:`LearnsNoise`) how far its frames are from new ones. A prior
     over movements is then learned from all of ``train``.
     """
-    known, held_out = _kept_out(model, strategy, train, val, session.seed)
+    known, held_out = kept_out(model, strategy, train, val, session.seed)
     history = _TRAINERS[type(strategy)](model, guide, strategy, known, val, session)
     model.eval()
     if guide is not None:
@@ -147,7 +148,7 @@ def _learn(model: nn.Module, posterior: Posterior, train: Any, held_out: Any) ->
         model.learn_prior(whole(train), posterior)
 
 
-def _kept_out(
+def kept_out(
     model: nn.Module, strategy: Inference, train: Any, val: Any, seed: int
 ) -> tuple[Any, Any]:
     """The movements to train on and those that are kept out, if any."""
