@@ -264,12 +264,14 @@ def _findings(mean: dict[str, dict[str, float]]) -> tuple[str, ...]:
     linear = min((n for n in mean if n.startswith("PCA")), key=lambda n: mean[n]["mse"])
     ratio = mean[linear]["mse"] / ours["mse"]
     verdict = "does as well or better" if ratio <= 1.05 else "does worse"
-    own = [f"{mean[n]['mse'] / ours['mse']:.3g} × ({n.split(': ')[1]})" for n in mean if "ε" in n]
+    own = {n.split(": ")[1]: mean[n]["mse"] / ours["mse"] for n in mean if "ε" in n}
+    told = " and ".join(f"{value:.3g} × ({name})" for name, value in own.items())
+    needed = "carries" if min(own.values()) > 1.05 else "does not carry"
     return (
         f"The path prior over principal components {verdict}: {linear} has {ratio:.2f} × the MSE "
         "of vae-dmp's own latent space.",
-        f"Without the path prior the MSE of vae-dmp is {' and '.join(own)}: what forecasts is the "
-        "mixture around the training movements' latent paths, not the prior of (76)–(78).",
+        f"Without the path prior the MSE of vae-dmp is {told}: the mixture around the training "
+        f"movements' latent paths {needed} the forecasts.",
     )
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "Forecasts",
     "Generates",
     "Imputes",
+    "Reaches",
     "Reconstructs",
     "Regresses",
     "Reports",
@@ -97,6 +98,13 @@ class Generates(Protocol):
         ``steps`` frames, (89).
         """
         ...
+
+
+@runtime_checkable
+class Reaches(Protocol):
+    """How far training movements reached, so that a goal far beyond is told of."""
+
+    reached: Float[Tensor, "2 channel"]
 
 
 @runtime_checkable

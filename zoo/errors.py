@@ -2,6 +2,7 @@
 
 __all__ = [
     "DamagedRunError",
+    "ExtrapolationWarning",
     "FewGroupsWarning",
     "FewerInducingWarning",
     "MovementLengthError",
@@ -115,3 +116,7 @@ class NotCalibratedWarning(UserWarning):
 
 class WindowsWarning(UserWarning):
     """Windows are given to a model of whole movements, or whole movements to one of windows."""
+
+
+class ExtrapolationWarning(UserWarning):
+    """A goal lies far outside of all that the training movements showed."""

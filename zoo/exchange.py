@@ -11,14 +11,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from zoo.assembly import Assembly
-from zoo.capabilities import FollowsPhase, Reports
+from zoo.capabilities import FollowsPhase, Reaches, Reports
 from zoo.datasets.records import Pairs, Sequences
 from zoo.datasets.scaling import Scaler
-from zoo.errors import WindowsWarning
+from zoo.errors import ExtrapolationWarning, WindowsWarning
 from zoo.inference.loader import whole
 from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.prediction import Predictive
@@ -26,6 +27,7 @@ from zoo.types import Batch, Posterior
 
 __all__ = ["Answer", "Exchange", "check_timing", "check_unseen", "fingerprints", "question"]
 
+FAR = 0.1
 Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
 
 
@@ -107,8 +109,33 @@ class Exchange:
         if not np.isfinite(array).all():
             raise ValueError("goal must be finite in every channel")
         rows = torch.from_numpy(np.broadcast_to(array, (count, width)).copy())
+        self._warn_beyond(rows)
         scaled = (rows - self.scaler.channel_shift) / self.scaler.channel_scale
         return scaled.to(dtype=self.assembly.dtype, device=self.assembly.device)
+
+    def _warn_beyond(self, goals: Float[Tensor, "sequence channel"]) -> None:
+        """Say which goals are further beyond what was demonstrated than a tenth of its range."""
+        model, layout = self.assembly.model, self.assembly.layout
+        if not isinstance(model, Reaches) or not model.reached.numel():
+            return
+        scale, shift = self.scaler.channel_scale, self.scaler.channel_shift
+        low, high = model.reached.to(goals) * scale + shift
+        beyond = torch.maximum(low - goals, goals - high) > FAR * (high - low)
+        beyond &= low.isfinite()
+        told = [
+            f"{layout.channels[c]} to {goals[i, c]:.4g} "
+            f"(demonstrated {low[c]:.4g} to {high[c]:.4g} {layout.units[c]}".rstrip()
+            + ")"
+            for i, c in beyond.nonzero().tolist()
+        ]
+        if told:
+            more = f" and {len(told) - 3} more" if len(told) > 3 else ""
+            warnings.warn(
+                f"{self.assembly.entry.name}: goals beyond the demonstrations: "
+                f"{', '.join(told[:3])}{more}; the movement is an extrapolation",
+                ExtrapolationWarning,
+                stacklevel=4,
+            )
 
     def onto(self, onto: Sequences, count: int) -> Sequences:
         """Movements to switch to, one for each of ``count``, in the model's scale."""

@@ -12,6 +12,7 @@ from support import CHANNELS, FRAMES, movements, run_of
 import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Sequences
+from zoo.errors import ExtrapolationWarning
 from zoo.prediction import Prediction
 from zoo.strategies import Exact
 
@@ -49,6 +50,18 @@ def test_goals_are_one_for_all_or_one_for_each(name: str) -> None:
     check(each, FRAMES)
     check(generated(name, goal=goals[0]), FRAMES)
     assert not torch.equal(each.mean, generated(name).mean)
+
+
+@pytest.mark.parametrize("name", ["vae-dmp", "vae-dmp-rhythmic", "ae-dmp"])
+def test_a_goal_far_beyond_the_demonstrations_is_told_of(name: str) -> None:
+    """0.3 of a joint's range too far; within a twentieth nothing."""
+    low, high = movements().values.amin((0, 1)), movements().values.amax((0, 1))
+    goal = movements().values[0, -1].clone()
+    goal[2] = high[2] + 0.05 * (high - low)[2]
+    generated(name, goal=goal.numpy())
+    goal[2] = high[2] + 0.3 * (high - low)[2]
+    with pytest.warns(ExtrapolationWarning, match=rf"^{name}: goals .* joint_2 to .* rad\)"):
+        generated(name, goal=goal.numpy())
 
 
 @pytest.mark.parametrize("name", DISCRETE)

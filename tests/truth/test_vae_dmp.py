@@ -493,3 +493,22 @@ def test_noise_of_movements_kept_out_is_the_bound_s_best():
         after = model.output_std.clone()
         model.learn_noise(quiet, posterior)
         assert bool((model.output_std >= after).all())
+
+
+@pytest.mark.parametrize("duration", [1.0, 1.7])
+def test_the_path_to_another_goal_ends_there(duration: float):
+    """With forces and velocities of any size, rolled out step by step."""
+    torch.manual_seed(11)
+    data = movements(2)
+    model, guide = build(data)
+    with torch.no_grad():
+        found = model._latents(GuidePosterior(guide).draw(whole(data), 3))
+        aimed = model._aimed(found, found.goal + torch.randn_like(found.goal))
+        pull = model._ended(aimed, model._pull(aimed, duration), duration)
+        system = replace(model.system, tau=duration)
+        z, ż = aimed.position, aimed.velocity / duration
+        for t in range(pull.shape[2]):
+            z̈ = system.alpha * (system.beta * (pull[:, :, t] - z) - duration * ż) / duration**2
+            ż = ż + z̈ * system.dt
+            z = z + ż * system.dt
+        torch.testing.assert_close(z, aimed.goal)

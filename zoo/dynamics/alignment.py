@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from zoo.dynamics.rollout import Timing
 from zoo.dynamics.sums import Movements
 from zoo.dynamics.weights import Basis
 
-__all__ = ["BasisOf", "align", "durations"]
+__all__ = ["BasisOf", "align", "durations", "extremes"]
 
 BasisOf = Callable[[int, Timing], Basis]
 
@@ -52,6 +52,21 @@ def durations(found: Sequence[Timing], count: int) -> list[Timing]:
     units = sorted({t.unit for t in found})
     ranks = torch.linspace(0, len(units) - 1, min(count, len(units))).round().int().tolist()
     return [Timing(units[rank]) for rank in ranks]
+
+
+def extremes(
+    values: Float[Tensor, "sequence time channel"], mask: Bool[Tensor, "sequence time channel"]
+) -> Float[Tensor, "2 channel"]:
+    """Least and greatest observed value of every channel.
+
+    >>> extremes(torch.tensor([[[1.0], [5.0], [2.0]]]), torch.tensor([[[True], [False], [True]]]))
+    tensor([[1.],
+            [2.]])
+    """
+    flat, seen = values.flatten(0, 1), mask.flatten(0, 1)
+    low = flat.masked_fill(~seen, torch.inf).amin(0)
+    high = flat.masked_fill(~seen, -torch.inf).amax(0)
+    return torch.stack([low, high])
 
 
 def _template(

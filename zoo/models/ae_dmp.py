@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from zoo.dynamics.alignment import extremes
 from zoo.dynamics.components import alike, ramp
 from zoo.dynamics.imitator import Imitator
 from zoo.dynamics.paths import PathPrior, Readout
@@ -103,6 +104,7 @@ class AeDmp(nn.Module):
     prior_movements: Tensor
     prior_residuals: Tensor
     prior_shape: Tensor
+    reached: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model of movements of ``layout.frames`` frames, all of one length."""
@@ -115,7 +117,7 @@ class AeDmp(nn.Module):
         self.decoder = mlp(sizes, config.activation)
         self.root = nn.Parameter(torch.tensor(config.noise_std**0.5))
         self.settled = self.integrated = config.pretraining < 1
-        for name in ("prior_movements", "prior_residuals", "prior_shape"):
+        for name in ("prior_movements", "prior_residuals", "prior_shape", "reached"):
             self.register_buffer(name, torch.empty(0))
 
     @property
@@ -223,6 +225,8 @@ class AeDmp(nn.Module):
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
         """Keep the θ of the training movements and what their roll-outs leave of the paths."""
+        mask = torch.ones_like(batch.values) > 0 if batch.mask is None else batch.mask
+        self.reached = extremes(batch.values, mask)
         y, seen = self._encoded(batch, posterior)
         self.prior_movements = self._imitated(batch, posterior)
         rolled = self.imitator.roll_out(self.prior_movements)

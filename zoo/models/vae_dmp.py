@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from zoo.dynamics.alignment import extremes
 from zoo.dynamics.components import ramp
 from zoo.dynamics.dmp import Response
 from zoo.dynamics.paths import Conditioned, PathPrior, Readout
@@ -20,9 +21,9 @@ from zoo.models.latent_dmp import Config, LatentDmp, check_end, check_whole
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
 
-__all__ = ["Config", "Latents", "VaeDmp", "observed_mean"]
+__all__ = ["Config", "Latents", "VaeDmp", "observed"]
 
-_LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape")
+_LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape", "reached")
 PRIOR_DRAWS = 32
 RESTARTS, KEPT = 4, 64
 UNSEEN = 1e6
@@ -43,12 +44,16 @@ class VaeDmp(LatentDmp):
     (80). Choices where the thesis is silent: g(z) = z + MLP(z); ż_1 has a Gaussian prior of its own
     and is recognised from the first two frames; σ = s² + floor.
 
-    Forecasts and imputation know neither w nor goal of a new movement: after training the latents
-    of the training movements become a mixture over latent paths, which is conditioned exactly on
-    the frames seen (:class:`~zoo.dynamics.paths.PathPrior`). A frame seen in part is a Gaussian at
+    The program gives reconstructions, new goals, durations and switches. **Forecasts and imputation
+    are not those of its p(w), p(z^goal)**, (76)–(78), which know neither w nor goal of a new
+    movement: they are those of a model of its own, the *latent path prior*. After training, the
+    latents of the training movements become a mixture over latent paths, with what the paths leave
+    of the encoded frames as a stationary process in place of ε; it is conditioned exactly on the
+    frames observed (:class:`~zoo.dynamics.paths.PathPrior`). ``python -m
+    benchmarks.latent_path_prior`` takes the two apart. A frame observed in part is a Gaussian at
     the mode of p(z | x_seen), which the decoder gives. σ is estimated again on movements that the
     networks were not trained on, where there are any (:meth:`learn_noise`). Movements must have one
-    common length.
+    common length, and end there.
     N. Chen, M. Karl, P. van der Smagt, *Dynamic movement primitives in latent space of
     time-dependent variational autoencoders*, Humanoids 2016.
     """
@@ -57,6 +62,7 @@ class VaeDmp(LatentDmp):
     prior_residuals: Tensor
     prior_observation: Tensor
     prior_shape: Tensor
+    reached: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """A model of movements of ``layout.frames`` frames, all of one length."""
@@ -135,6 +141,8 @@ class VaeDmp(LatentDmp):
         if goal is not None:
             here = self._aimed(here, self._goal(goal, guide, draws))
         pull, position, velocity = self._pull(here, duration), here.position, here.velocity
+        if goal is not None and self.phased:
+            pull = self._ended(here, pull, duration)
         if onto is not None:
             there = self._pull(self._latents(guide.draw(onto, draws)), duration)
             η = ramp(pull.shape[-2] + 1, start, steps)[:, None]
@@ -155,6 +163,7 @@ class VaeDmp(LatentDmp):
         found = self._latents(posterior.draw(batch, PRIOR_DRAWS))
         parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
         self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
+        self.reached = extremes(batch.values, observed(batch))
         frames, seen = self._observe(batch, posterior), self._frames_seen(batch)
         self.prior_residuals = torch.zeros_like(frames)
         self.prior_shape = frames.new_empty(0)
@@ -173,8 +182,9 @@ class VaeDmp(LatentDmp):
         """
         z = posterior.encode(batch.values, batch.mask).sample((PRIOR_DRAWS,))
         error = (self.decoder(self.embed(z)) - batch.values).square().mean(0)
-        found = observed_mean(error, batch.mask).sqrt()
-        std = torch.maximum(found, self.output_std)
+        mask = observed(batch)
+        mean = (error * mask).sum((0, 1)) / mask.sum((0, 1)).clamp(min=1)
+        std = torch.maximum(mean.sqrt(), self.output_std)
         self.output_root.copy_((std - self.config.output_floor).sqrt())
 
     def prior_without(self, row: int) -> PathPrior:
@@ -230,6 +240,18 @@ class VaeDmp(LatentDmp):
         old, new = found.goal - found.position, goal - found.position
         ratio = (new * old + GOAL_SLACK) / (old.square() + GOAL_SLACK)
         return replace(found, w=found.w * ratio.unsqueeze(2), goal=goal)
+
+    def _ended(
+        self, found: Latents, pull: Float[Tensor, "sample sequence step d"], duration: float
+    ) -> Float[Tensor, "sample sequence step d"]:
+        """The attractor moved so that the path without noise ends at the goal, not on its way."""
+        system = replace(self.system, tau=duration)
+        response = Response.of(system, pull.shape[-2] + 1, pull.dtype, pull.device)
+        rest, force = torch.zeros_like(found.position), system.stiffness * pull
+        path = response.states(found.position, found.velocity / duration, rest, force)[0]
+        ones = system.stiffness * pull.new_ones(pull.shape[-2], 1)
+        gain = response.product(pull.new_zeros(2, 1), ones)[0][-1]
+        return pull + ((found.goal - path[..., -1, :]) / gain).unsqueeze(2)
 
     def _paths(self, drawn: dict[str, Tensor], batch: Batch, draws: int) -> Tensor:
         flat = {name: value.flatten(0, 1) for name, value in drawn.items()}
@@ -340,14 +362,9 @@ def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
     return bool((mask == mask[:1, :, :1]).all())
 
 
-def observed_mean(
-    error: Float[Tensor, "window time channel"], mask: Bool[Tensor, "window time channel"] | None
-) -> Float[Tensor, " channel"]:
-    """Mean of every channel over the entries observed."""
-    if mask is None:
-        return error.mean((0, 1))
-    mean: Tensor = (error * mask).sum((0, 1)) / mask.sum((0, 1)).clamp(min=1)
-    return mean
+def observed(batch: Batch) -> Bool[Tensor, "window time channel"]:
+    """Which entries were observed."""
+    return torch.ones_like(batch.values, dtype=torch.bool) if batch.mask is None else batch.mask
 
 
 def _need(posterior: Posterior | None) -> Posterior:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zoo.datasets.records import Sequences
+from zoo.dynamics.alignment import extremes
 from zoo.dynamics.cycles import CyclePrior
 from zoo.dynamics.dmp import Response, rhythmic_basis
 from zoo.dynamics.plan import Plan
@@ -20,7 +21,7 @@ from zoo.dynamics.timing import period_of, tempos
 from zoo.errors import NotFittedError
 from zoo.models import latent_dmp
 from zoo.models.latent_dmp import ALPHA_FRAME
-from zoo.models.vae_dmp import PRIOR_DRAWS, Latents, VaeDmp
+from zoo.models.vae_dmp import PRIOR_DRAWS, Latents, VaeDmp, observed
 from zoo.types import Batch, Layout, Posterior
 
 __all__ = ["Config", "RhythmicVaeDmp"]
@@ -65,7 +66,8 @@ class RhythmicVaeDmp(VaeDmp):
     §6.2 the model; the two together are a choice of this package, after Ijspeert et al.,
     *Dynamical movement primitives*, Neural Computation 25 (2013).
 
-    Forecasts and imputation condition a mixture over limit cycles: the weights and centres of the
+    Forecasts and imputation are those of a latent path prior, not of the program's p(w), p(φ): they
+    condition a mixture over limit cycles, the weights and centres of the
     training movements, at every phase and at tempos like those found, with what their cycles leave
     as a stationary process (:class:`~zoo.dynamics.cycles.CyclePrior`). Another goal is another
     centre; another duration stretches the period. Movements must have one common length; a forecast
@@ -135,6 +137,7 @@ class RhythmicVaeDmp(VaeDmp):
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
         """Keep weights, centres and timings of the training movements, and what they leave."""
+        self.reached = extremes(batch.values, observed(batch))
         drawn = posterior.draw(batch, PRIOR_DRAWS)
         found = self._latents(drawn)
         rows = torch.cat([found.w, found.goal.unsqueeze(2)], dim=2)
