@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -60,12 +61,19 @@ def fit(
     folder, made_of = Path(run_dir), fingerprint(assembly, train, val)
     with claimed(folder, made_of, resume, overwrite) as finished:
         if finished:
-            return replace(
-                load_run(folder, device=assembly.device), recalibrations={}, calibrated_on=[]
-            )
+            return _kept(assembly, folder, progress)
         run = _fitted(assembly, train, val, replace(session, folder=folder), made_of)
         save_run(run, folder)
     return run
+
+
+def _kept(assembly: Assembly, folder: Path, told: bool) -> Run:
+    """The finished run of a folder as the training left it."""
+    run = load_run(folder, device=assembly.device)
+    if told:
+        done = f"{run.name}: trained before in {run.seconds:.0f} s, taken from {folder}"
+        print(done, file=sys.stderr)
+    return replace(run, recalibrations={}, calibrated_on=[])
 
 
 def _fitted(

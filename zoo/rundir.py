@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 from zoo import archive
 from zoo.errors import DamagedRunError, OtherTrainingError, RunExistsError
 from zoo.inference import checkpoint, journal
+from zoo.inference.checkpoint import ANEW
 from zoo.lock import locked
 from zoo.storage import made_of_run
 
@@ -18,7 +19,6 @@ __all__ = ["Resume", "claimed"]
 
 Resume = Literal["never", "auto", "must"]
 _BEGUN = "training.json"
-_REPLACE = "another run_dir, or overwrite=True (--overwrite) to replace it"
 
 
 @contextmanager
@@ -60,14 +60,22 @@ def _found(folder: Path, made_of: dict[str, str], resume: Resume) -> bool:
     if resume == "never":
         raise RunExistsError(
             f"{folder} holds a {'finished run' if finished else 'begun training'}: "
-            f"resume='auto' (--resume) to go on with it, {_REPLACE}"
+            f"resume='auto' (--resume) to go on with it; else {ANEW}"
         )
-    saved = made_of_run(folder) if finished else _begun(folder)
+    saved = _saved(folder) if finished else _begun(folder)
     if not saved:
-        raise OtherTrainingError(f"{folder} does not tell how it was trained: take {_REPLACE}")
+        raise OtherTrainingError(f"{folder} does not tell how it was trained: {ANEW}")
     if gap := checkpoint.difference(saved, made_of):
-        raise OtherTrainingError(f"{folder} holds another training: {gap}. Take {_REPLACE}")
+        raise OtherTrainingError(f"{folder} holds another training: {gap}. Please {ANEW}")
     return finished
+
+
+def _saved(folder: Path) -> dict[str, str]:
+    """What the finished run in the folder is made of."""
+    try:
+        return made_of_run(folder)
+    except DamagedRunError as error:
+        raise DamagedRunError(f"{error}; {ANEW}") from None
 
 
 def _begun(folder: Path) -> dict[str, str]:
@@ -79,7 +87,7 @@ def _begun(folder: Path) -> dict[str, str]:
         found: Any = json.loads(path.read_text(encoding="utf-8"))["made_of"]
         return dict(found)
     except (OSError, ValueError, TypeError, KeyError) as error:
-        raise DamagedRunError(f"{path} does not tell of a training: {error!r}") from None
+        raise DamagedRunError(f"{path} does not tell of a training: {error!r}; {ANEW}") from None
 
 
 def _empty(folder: Path) -> None:

@@ -21,7 +21,7 @@ from zoo.assembly import Assembly, assemble
 from zoo.catalogue import CATALOGUE
 from zoo.codehash import hashes
 from zoo.datasets.records import Sequences
-from zoo.errors import OtherTrainingError, RunExistsError, RunLockedError
+from zoo.errors import DamagedRunError, OtherTrainingError, RunExistsError, RunLockedError
 from zoo.experiments.kept import timed
 from zoo.experiments.kept import trained as trained_once
 
@@ -146,7 +146,11 @@ def test_a_changed_module_is_named(
     [("vae", QUICK), ("mean", {}), ("pca", {"latent_dim": 2}), ("gp", {"iterations": 4})],
 )
 def test_the_same_call_returns_the_same_bits_without_training(
-    name: str, settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    settings: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Variational, closed-form and marginal-likelihood runs alike, and the duration stays."""
     data = pairs() if CATALOGUE[name].data == "pairs" else TRAIN
@@ -156,6 +160,10 @@ def test_the_same_call_returns_the_same_bits_without_training(
     assert bits(again) == bits(first)
     assert (again.seconds, again.history) == (first.seconds, first.history)
     assert again.made_of == first.made_of
+    zoo.fit(
+        zoo.create(name, data, **settings), data, run_dir=tmp_path, resume="auto", progress=True
+    )
+    assert f"{name}: trained before in" in capsys.readouterr().err
 
 
 def _never(*_: object) -> None:
@@ -260,6 +268,19 @@ def test_must_finds_nothing_in_an_empty_folder(tmp_path: Path) -> None:
     for name in ("mean", "pca"):
         with pytest.raises(FileNotFoundError, match="holds no training"):
             zoo.fit(zoo.create(name, TRAIN), TRAIN, run_dir=tmp_path, resume="must")
+
+
+def test_what_is_damaged_says_what_to_do(tmp_path: Path) -> None:
+    zoo.fit(vae(), TRAIN, run_dir=tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(DamagedRunError, match=r"run.json.*overwrite=True \(--overwrite\) to begin"):
+        zoo.fit(vae(), TRAIN, run_dir=tmp_path, resume="auto")
+    (tmp_path / "run.json").unlink()
+    next(tmp_path.glob("checkpoint-*")).write_bytes(b"")
+    with pytest.raises(DamagedRunError, match=r"checkpoint.*damaged.*overwrite=True"):
+        zoo.fit(vae(), TRAIN, run_dir=tmp_path, resume="auto")
+    whole = zoo.fit(vae(), TRAIN, run_dir=tmp_path, overwrite=True)
+    assert bits(whole) == bits(zoo.load(tmp_path))
 
 
 def test_a_training_that_failed_leaves_the_folder_free(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def _run(assembly: Assembly, data: Pairs | Sequences, home: str, label: str, pro
         return fit(assembly, data, progress=progress)
     folder = Path("runs") / home / f"{name}-{label}-{key(fingerprint(assembly, data))}"
     reused = archive.exists(folder, "run")
-    run = fit(assembly, data, run_dir=folder, resume="auto", progress=progress)
+    run = fit(assembly, data, run_dir=folder, resume="auto", progress=progress and not reused)
     if reused:
         told = f"{name} ({label}): reused from {folder}, trained in {run.seconds:.0f} s"
         print(told, file=sys.stderr)

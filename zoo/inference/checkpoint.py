@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from zoo import archive
 from zoo.errors import DamagedRunError
 
-__all__ = ["capture", "clear", "difference", "exists", "read", "restore", "write"]
+__all__ = ["ANEW", "capture", "clear", "difference", "exists", "read", "restore", "write"]
 
 VERSION = 1
+ANEW = "take another run_dir, or overwrite=True (--overwrite) to begin anew"
 _STEM = "checkpoint"
 _MOST = 3
 
@@ -28,7 +29,10 @@ def write(folder: Path, tensors: Mapping[str, Tensor], state: Mapping[str, Any])
 
 def read(folder: Path) -> tuple[Tensors, dict[str, Any]]:
     """Tensors and state of the checkpoint; what is not whole and ours is a DamagedRunError."""
-    body, tensors = archive.read(folder, _STEM, version=VERSION)
+    try:
+        body, tensors = archive.read(folder, _STEM, version=VERSION)
+    except DamagedRunError as error:
+        raise DamagedRunError(f"{error}; {ANEW}") from None
     return tensors, body["state"]
 
 

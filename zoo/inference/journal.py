@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from zoo.errors import DamagedRunError
+from zoo.inference.checkpoint import ANEW
 from zoo.inference.minimise import Evaluate, Vector
 
 __all__ = ["Journal", "clear", "exists"]
@@ -61,7 +62,7 @@ class Journal:
         if known is None:
             self._append(_entry(x, value, gradient))
         elif known != _entry(x, value, gradient):
-            raise DamagedRunError(f"{self.path} was written with other data or settings")
+            raise DamagedRunError(f"{self.path} was written with other data or settings: {ANEW}")
         return value, gradient
 
     def _open(self, resume: str) -> list[dict[str, Any]]:
@@ -84,7 +85,7 @@ class Journal:
     def _recall(self, known: dict[str, Any], x: Vector) -> tuple[float, Vector]:
         if known["at"] != _digest(x):
             raise DamagedRunError(
-                f"{self.path}: evaluation {self.count} was made elsewhere; other settings?"
+                f"{self.path}: evaluation {self.count} was made at another point: {ANEW}"
             )
         return _number(known["value"]), np.array([_number(g) for g in known["gradient"]])
 
@@ -100,7 +101,7 @@ def _parse(path: Path, text: bytes) -> list[Any]:
     try:
         return [json.loads(line) for line in text.splitlines()]
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DamagedRunError(f"{path}: not a journal of evaluations: {error}") from None
+        raise DamagedRunError(f"{path}: not a journal of evaluations: {error}; {ANEW}") from None
 
 
 def _entry(x: Vector, value: float, gradient: Vector) -> dict[str, Any]:

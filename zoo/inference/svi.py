@@ -58,8 +58,8 @@ def fit_svi(
     un-tempered validation bound is restored; only epochs with c = β = 1 count.
 
     Raises TrainingError where the loss stays non-finite however small the step, DamagedRunError
-    for a checkpoint that is damaged or of another training, and FileNotFoundError where
-    ``resume="must"`` finds none.
+    for a checkpoint that is damaged, OtherTrainingError for one of another training, and
+    FileNotFoundError where ``resume="must"`` finds none.
     """
     place = None if folder is None else Path(folder)
     with ExitStack() as scope:
@@ -227,8 +227,10 @@ class _Training:
 
     def _interrupted(self) -> str:
         where = f"interrupted in epoch {self.state.place.epoch} of {self.strategy.epochs}"
-        if self.folder is None or not checkpoint.exists(self.folder):
-            return f"{where}; no checkpoint was kept"
+        if self.folder is None:
+            return f"{where}; nothing was kept: with run_dir=... checkpoints are"
+        if not checkpoint.exists(self.folder):
+            return f"{where}; before the first checkpoint in {self.folder}: start it again"
         return f"{where}; resume='auto' goes on from the checkpoint in {self.folder}"
 
 
