@@ -34,6 +34,7 @@ __all__ = [
     "check_blind",
     "check_exact",
     "check_program",
+    "check_sites",
     "check_uniform",
     "check_weights",
     "drawn",
@@ -87,6 +88,19 @@ def check_exact(run: Run, draws: int = 4) -> float:
     tolerance = torch.finfo(run.assembly.dtype).eps ** 0.5 * size
     assert np.ptp(evidence) <= tolerance, f"the bound moves by {np.ptp(evidence):.3g}: {evidence}"
     return float(evidence[0])
+
+
+def check_sites(run: Run) -> None:
+    """What the guide draws is what the program does not observe."""
+    guide, model = run.assembly.guide, run.model
+    batch = batch_of(run)
+    with seeded(0), torch.no_grad():
+        mine = poutine.trace(guide).get_trace(batch)
+        free = poutine.trace(model).get_trace(batch.unobserved())
+        given = poutine.trace(poutine.replay(model, trace=mine)).get_trace(batch)
+    latent = {n for n in given.stochastic_nodes if _is_data(given.nodes[n])}
+    assert latent == set(mine.stochastic_nodes)
+    assert latent <= set(free.stochastic_nodes)
 
 
 def drawn(run: Run, count: int, seed: int) -> Sequences:
