@@ -91,6 +91,15 @@ def test_split_refuses_what_it_cannot_do() -> None:
             data.split(by="subject", parts=parts)
 
 
+def test_shares_of_a_split_are_of_the_rows() -> None:
+    """One group of twelve rows and many of one: both halves have the rows, not the groups."""
+    members = [*["large"] * 12, *map(str, range(48))]
+    data = Pairs.from_arrays(np.zeros((60, 1)), np.zeros(60), groups={"g": members})
+    sizes = [len(data.split(by="g", parts=(1, 1), seed=seed)[0]) for seed in range(20)]
+    assert all(abs(size - 30) <= 6 for size in sizes)
+    assert np.median(sizes) == 30
+
+
 def test_split_by_frame_takes_movements_apart() -> None:
     data = Sequences.from_arrays([np.ones((6, 1)), np.ones((4, 1))], rate=1.0)
     train, test = data.split(by="frame", parts=(0.5, 0.5))

@@ -24,6 +24,7 @@ from zoo.evaluation.calibration import (
     recalibration_from_state,
 )
 from zoo.evaluation.factors import crossed, standardised
+from zoo.evaluation.pool import Pool
 from zoo.evaluation.promise import promised
 from zoo.evaluation.scores import score
 from zoo.prediction import Prediction, Predictive
@@ -333,3 +334,13 @@ def test_the_factors_of_a_group_are_those_of_the_others(by: tuple[Any, ...]) -> 
     assert torch.equal(found[0][4], found[1][4])
     others = torch.arange(12) != 4
     assert not torch.equal(found[0][others], found[1][others])
+
+
+def test_groups_of_many_and_of_few_entries_weigh_the_same() -> None:
+    """Thirty entries of one group are half of the weight, the one of another is the rest."""
+    scores = torch.full((31, 1), 1.0, dtype=torch.float64)
+    scores[30] = 5.0
+    groups = {"trial": ["long"] * 30 + ["short"]}
+    answer = Answer.of(items(scores, noise=torch.ones(1)), scores, None, groups)
+    found = Pool.of(scores, answer).quantile(torch.tensor([0.4, 0.6], dtype=torch.float64))
+    assert found.tolist() == [1.0, 5.0]

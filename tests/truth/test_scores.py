@@ -226,6 +226,24 @@ def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
     assert found.error == pytest.approx(float(x.std() / math.sqrt(20)))
 
 
+def test_the_standard_error_of_r2_leaves_out_a_group_and_its_mean() -> None:
+    """By leaving out every group in turn and computing R² of the rest anew."""
+    generator = torch.Generator().manual_seed(5)
+    level = 3 * torch.randn(6, 1, 1, generator=generator, dtype=torch.float64)
+    truth = level + torch.randn(6, 5, 1, generator=generator, dtype=torch.float64)
+    guess = truth + 0.5 * torch.randn(6, 5, 1, generator=generator, dtype=torch.float64)
+
+    def r2(rows: torch.Tensor) -> float:
+        apart = (truth[rows] - truth[rows].mean()).square().sum()
+        return float(1 - (truth[rows] - guess[rows]).square().sum() / apart)
+
+    found = score(prediction((6, 5, 1), location=guess[None]), truth)["r2"]
+    left_out = [r2(torch.arange(6) != i) for i in range(6)]
+    assert found is not None
+    assert found.value == pytest.approx(r2(torch.arange(6)))
+    assert found.error == pytest.approx(np.std(left_out) * math.sqrt(5))
+
+
 def test_a_deterministic_prediction_has_errors_only() -> None:
     p = prediction(location=torch.zeros(1, *SHAPE))
     scores = score(p, torch.ones(SHAPE), groups=GROUPS)
