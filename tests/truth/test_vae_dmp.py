@@ -406,7 +406,8 @@ def test_a_section_is_imputed_alike_by_one_factorisation_and_by_one_for_each_mov
         mask[:, 4:7] = False
         shared = model._conditioned(replace(batch, mask=mask), posterior, FRAMES)
         other = torch.cat([mask, torch.ones_like(mask[:1])])
-        four = {n: torch.cat([getattr(batch, n), getattr(batch, n)[:1]]) for n in ("values",)}
+        names = ("values", "start", "sequence")
+        four = {n: torch.cat([getattr(batch, n), getattr(batch, n)[:1]]) for n in names}
         each = model._conditioned(replace(batch, mask=other, **four), posterior, FRAMES)
         torch.testing.assert_close(shared.means, each.means[:3], rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(shared.covariance, each.covariance[0], rtol=1e-3, atol=1e-4)
