@@ -14,7 +14,7 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
-from zoo.automatic import with_guide
+from zoo import automatic
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import UnknownNameError
@@ -129,7 +129,7 @@ def assemble(
     """Build model and guide of ``entry`` for ``layout`` from a seed."""
     if layout.kind != entry.data:
         raise ValueError(f"{entry.name} needs {entry.data}; got {layout.kind}")
-    entry = with_guide(entry, settings.get("guide"))
+    entry = automatic.with_guide(entry, settings.get("guide"))
     known = {*options(entry), "guide"}
     for key in settings:
         if key not in known:
@@ -172,6 +172,8 @@ def options(entry: Entry) -> dict[str, tuple[str, Any, Any]]:
     kinds = get_type_hints(type(entry.inference))
     for field in dataclasses.fields(entry.inference):
         found[field.name] = ("inference", kinds[field.name], getattr(entry.inference, field.name))
+    if getattr(load(entry.model), "global_sites", ()):
+        found["guide"] = ("guide", automatic.Name, None)
     found["scaling"] = ("data", Scaling, entry.scaling)
     return found
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 from zoo.errors import UnknownNameError
 from zoo.registry import Entry
 from zoo.strategies import Svi
 
-__all__ = ["AUTOMATIC", "with_guide"]
+__all__ = ["AUTOMATIC", "Name", "with_guide"]
 
+Name = Literal["auto-delta", "auto-normal", "auto-multivariate-normal"]
 AUTOMATIC = {
     "auto-delta": "zoo.guides.automatic:Delta",
     "auto-normal": "zoo.guides.automatic:Normal",

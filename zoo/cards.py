@@ -130,7 +130,8 @@ def _meanings(entry: Entry) -> Iterator[str]:
 def _type(kind: Any) -> str:
     """The values that a setting takes, in words."""
     words = kind.__name__ if isinstance(kind, type) else str(kind)
-    return re.sub(r"(?:typing\.)?Literal\[([^]]*)\]", _choices, words)
+    words = re.sub(r"(?:typing\.)?Literal\[([^]]*)\]", _choices, words)
+    return re.sub(r"^typing\.Optional\[(.*)\]$", r"\1 | None", words)
 
 
 def _choices(match: re.Match[str]) -> str:
