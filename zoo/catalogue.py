@@ -229,7 +229,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="mean",
-            summary="The training mean of every frame: the zero line of a sceptic",
+            summary="The training mean of every frame: the reference of R²",
             thesis="baseline, not in the thesis",
             model="zoo.models.mean:Mean",
             guide=None,
@@ -279,7 +279,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="mean-regressor",
-            summary="The training mean of every target: the zero line of regression",
+            summary="The training mean of every target: the reference of R²",
             thesis="baseline, not in the thesis",
             model="zoo.models.mean:MeanRegressor",
             guide=None,

@@ -1,4 +1,4 @@
-"""The sceptic's baselines against the same numbers by other roads."""
+"""The baselines against the same numbers by other roads."""
 
 from __future__ import annotations
 

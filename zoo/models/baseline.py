@@ -1,4 +1,4 @@
-"""What the sceptic's baselines share: checked training data, masked moments, the observed site."""
+"""What the baselines share: checked training data, masked moments, the observed site."""
 
 from __future__ import annotations
 

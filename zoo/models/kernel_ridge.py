@@ -113,7 +113,8 @@ class KernelRidge(nn.Module):
     training movements left out, windows of one movement together, over three of the frames asked
     for; s_tc is the root mean square of these errors. Saunders, Gammerman & Vovk, *Ridge regression
     learning algorithm in dual variables* (1998); errors of groups left out in closed form from
-    (K + λI)⁻¹. A sceptic's baseline, not in the thesis.
+    (K + λI)⁻¹. It is a baseline, not in the thesis, and it has no guide: there is no latent
+    variable.
 
     Seen entries are returned as they are. Missing training entries are interpolated in time; errors
     leave them out. Bands have the same width wherever a movement lies, and noise is independent

@@ -51,7 +51,8 @@ class LastValue(nn.Module):
     (s_h² + s_h'² − s_{|h−h'|}²)/2, projected to the nearest positive one with the same s_h. There
     is no observation noise: all spread is of the path. A channel counts its lead from the frame
     that it was last seen in; one that was not seen at all gets its training mean and deviation.
-    It knows no velocity and no posture: it says what standing still is worth.
+    It knows no velocity and no posture: it says what standing still is worth. It is a baseline, not
+    in the thesis, and it has no guide: there is no latent variable.
 
     Defaults: data standardised; missing entries left out.
     """

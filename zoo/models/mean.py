@@ -57,11 +57,12 @@ class Mean(_Moments):
 
     x_{t,c} ~ N(m_{t,c}, s_{t,c}²), m_{t,c} known to s_{t,c}/√n
 
-    The sceptic's zero line (it is what R² compares with): m and s are the mean and the standard
+    The reference of R², and what every model has to beat: m and s are the mean and the standard
     deviation of the n training movements that have frame t; a frame that fewer than two have, or
     beyond the longest, gets those of all frames of its channel. It answers every question by the
     same movement, so that it shows what mere knowledge of the task is worth. Frames and channels
-    are independent given m, and nothing that was seen changes the answer.
+    are independent given m, and nothing that was observed changes the answer. It is a baseline, not
+    in the thesis, and it has no guide: there is no latent variable.
 
     Defaults: data standardised; missing entries left out.
     """
@@ -120,9 +121,10 @@ class MeanRegressor(_Moments):
 
     y_p ~ N(m_p, s_p²), m_p known to s_p/√n
 
-    The sceptic's zero line of regression (it is what R² compares with, and what a Gaussian
+    The reference of R² in regression (it is what R² compares with, and what a Gaussian
     process falls back to far from its data): m and s are the mean and the standard deviation of
-    the n training items that have target p. Targets are independent; inputs are not looked at.
+    the n training items that have target p. Targets are independent; inputs are not looked at. It
+    is a baseline, not in the thesis, and it has no guide: there is no latent variable.
 
     Defaults: data standardised; missing targets left out.
     """
