@@ -19,8 +19,10 @@ from zoo.strategies import Exact
 NAMES = CATALOGUE.names(can="generate")
 EXACT = [name for name in NAMES if isinstance(CATALOGUE[name].inference, Exact)]
 DISCRETE = [name for name in EXACT if CATALOGUE[name].config.get("kind") != "rhythmic"]
+FOLLOWING = ("vae-dmp", "vae-dmp-rhythmic", "ae-dmp", "dmp", "dmp-rhythmic", "pca-dmp")
 every = pytest.mark.parametrize("name", NAMES)
 exact = pytest.mark.parametrize("name", EXACT)
+far = pytest.mark.filterwarnings("ignore::zoo.errors.ExtrapolationWarning")
 
 
 def generated(name: str, like: Sequences | None = None, **wishes: Any) -> Prediction:
@@ -52,7 +54,9 @@ def test_goals_are_one_for_all_or_one_for_each(name: str) -> None:
     assert not torch.equal(each.mean, generated(name).mean)
 
 
-@pytest.mark.parametrize("name", ["vae-dmp", "vae-dmp-rhythmic", "ae-dmp"])
+@pytest.mark.parametrize(
+    "name", ["vae-dmp", "vae-dmp-rhythmic", "ae-dmp", "dmp", "dmp-rhythmic", "pca-dmp"]
+)
 def test_a_goal_far_beyond_the_demonstrations_is_told_of(name: str) -> None:
     """0.3 of a joint's range too far; within a twentieth nothing."""
     low, high = movements().values.amin((0, 1)), movements().values.amax((0, 1))
@@ -64,6 +68,7 @@ def test_a_goal_far_beyond_the_demonstrations_is_told_of(name: str) -> None:
         generated(name, goal=goal.numpy())
 
 
+@far
 @pytest.mark.parametrize("name", DISCRETE)
 def test_the_goal_is_reached(name: str) -> None:
     apart = movements().values[3:6, -1] - movements().values[:3, -1]
@@ -126,6 +131,7 @@ def test_impossible_wishes_are_named(name: str, wishes: dict[str, Any], message:
         generated(name, **given)
 
 
+@far
 @exact
 def test_movements_of_several_lengths_keep_their_own_goals_and_switches(name: str) -> None:
     whole = [v.numpy() for v in movements().values]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pyro
 import pytest
 import torch
+from pyro import poutine
 
+import zoo
+from zoo import mixtures
 from zoo.datasets.records import Sequences
 from zoo.dynamics.dmp import Response, Transformation, discrete_basis, phase
 from zoo.dynamics.imitation import (
@@ -22,9 +27,10 @@ from zoo.dynamics.imitation import (
 from zoo.dynamics.kalman import PathNoise
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Timing, roll_out
-from zoo.dynamics.sums import sights
 from zoo.dynamics.timing import period_of
-from zoo.errors import NotFittedError
+from zoo.errors import ExtrapolationWarning, NotFittedError
+from zoo.guides.exact import Config as ExactConfig
+from zoo.guides.exact import ExactPosterior
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.models.dmp import DMP, Config
@@ -129,11 +135,14 @@ def test_population_is_a_dense_gaussian():
     torch.testing.assert_close(population.log_evidence(precision, linear), evidence)
 
 
-def trained(count=6, seed=0, **settings):
+def trained(count=6, seed=0, plain=True, **settings):
+    """A model, without scales and at full information where one Gaussian is to be compared."""
     arrays = [movement(seed + i, FRAMES, CHANNELS).numpy() for i in range(count)]
     data = Sequences.from_arrays(arrays, rate=30.0)
     model = DMP(data.layout, Config(kernels=5, **settings))
     model.condition(data)
+    if plain:
+        model.scales, model.information = torch.ones(1).double(), torch.ones(()).double()
     return model, data
 
 
@@ -186,9 +195,72 @@ def test_evidence_of_every_timing_is_the_density_of_the_dense_gaussian(hidden):
         law = torch.distributions.MultivariateNormal(
             mean[s], (covariance + torch.diag(noise))[s][:, s]
         )
-        (view,) = sights(model.primitive, [timing], model.ratio, seen)
-        found = model._evidence(view.sums(view.errors(x), 2, FRAMES))
-        torch.testing.assert_close(found, law.log_prob(x.mT.flatten(1)[:, s]), rtol=1e-9, atol=1e-7)
+        given = model._given([timing])
+        (group,) = given.groups(x, seen.expand_as(x))
+        expected = law.log_prob(x.mT.flatten(1)[:, s])
+        torch.testing.assert_close(given.evidence(group)[0, 0], expected, rtol=1e-9, atol=1e-7)
+
+
+def tempered(law, x, information, noise):
+    """log ∫ p(θ) p(x | θ)^c dθ by the dense Gaussian whose noise given θ is divided by c."""
+    mean, covariance = law
+    count, c = len(x), information
+    total = torch.distributions.MultivariateNormal(mean, covariance + noise / c).log_prob(x)
+    volume = torch.logdet(noise) + count * math.log(2 * math.pi)
+    return total + (1 - c) / 2 * volume - count / 2 * math.log(c)
+
+
+def evidence(model, timings, x, seen):
+    """Log evidence of one movement, summed over timings and scales by dense Gaussians."""
+    s, each = seen.T.flatten(), []
+    for timing in timings:
+        frames = len(x)
+        design = torch.block_diag(*[roll_out(model.primitive, frames, timing)] * CHANNELS)[s]
+        response = PathNoise(model.primitive.system(timing), frames)
+        forces = response.respond(torch.eye(frames - 1, dtype=torch.float64))
+        blocks = [
+            v * (forces @ forces.T + r * torch.eye(frames))
+            for v, r in zip(model.noise.square(), model.ratio, strict=True)
+        ]
+        noise = torch.block_diag(*blocks)[s][:, s]
+        mean, covariance = dense(model.population)
+        for scale in model.scales:
+            law = design @ mean, scale**2 * design @ covariance @ design.T
+            each.append(tempered(law, x.T.flatten()[s], float(model.information), noise))
+    return torch.stack(each).logsumexp(0) - math.log(len(each))
+
+
+def rhythmic():
+    time = np.arange(45)[:, None]
+    starts = np.random.default_rng(0).uniform(0, 2 * np.pi, 4)
+    turns = [2 * np.pi * time / 20 + s for s in starts]
+    arrays = [np.concatenate([np.sin(a), np.cos(2 * a)], 1) for a in turns]
+    noisy = [a + 0.05 * np.random.default_rng(1).normal(size=a.shape) for a in arrays]
+    data = Sequences.from_arrays(noisy, rate=30.0)
+    model = DMP(data.layout, Config(kind="rhythmic", kernels=5))
+    model.condition(data)
+    model.units, model.offsets = model.units[::9].clone(), model.offsets[::9].clone()
+    return model, data
+
+
+@pytest.mark.parametrize("make", [lambda: trained(plain=False), lambda: trained(1), rhythmic])
+@pytest.mark.parametrize("information", [1.0, 0.3])
+def test_guide_is_the_posterior_of_the_program_at_every_draw(make, information):
+    model, data = make()
+    model.information = torch.tensor(information).double()
+    batch = whole(data[[0]] if len(data) == 1 else data[[0, 2]])
+    seen = torch.rand(batch.values.shape, generator=torch.Generator().manual_seed(1)) < 0.8
+    batch = replace(batch, movements=batch.movements * seen, movement_mask=seen)
+    guide = ExactPosterior(data.layout, model, ExactConfig())
+    timings = model._whole(batch.movements.shape[1])
+    pairs = zip(batch.movements, seen, strict=True)
+    expected = sum(evidence(model, timings, x, s) for x, s in pairs)
+    for seed in range(4):
+        pyro.set_rng_seed(seed)
+        drawn = poutine.trace(guide).get_trace(batch)
+        joint_density = poutine.trace(poutine.replay(model, drawn)).get_trace(batch)
+        bound = joint_density.log_prob_sum() - drawn.log_prob_sum()
+        torch.testing.assert_close(bound, expected, rtol=1e-8, atol=1e-6)
 
 
 def test_draws_are_made_when_they_are_asked_for_and_by_the_seed():
@@ -218,31 +290,33 @@ def test_draws_have_the_exact_moments():
     assert (ratio - 1).abs().max() < 6 * (2 / count) ** 0.5
 
 
+def program_draws(model, count):
+    blank = Sequences.from_arrays(np.zeros((count, FRAMES, CHANNELS)), rate=30.0)
+    with seeded(1):
+        return poutine.trace(model).get_trace(whole(blank).unobserved()).nodes["x"]["value"]
+
+
 def test_program_draws_from_the_same_gaussian():
     model, _ = trained()
-    many = Sequences.from_arrays(np.zeros((4000, FRAMES, CHANNELS)), rate=30.0)
-    with seeded(1):
-        paths = model(whole(many))
-    mean, covariance, _ = joint(model)
-    path = mean.view(CHANNELS, FRAMES).T
-    spread = covariance.diagonal().view(CHANNELS, FRAMES).T.sqrt()
-    assert ((paths.mean(0) - path).abs() / spread).max() < 6 / len(many) ** 0.5
-    ratio = paths.var(0) / spread.square()
-    assert (ratio - 1).abs().max() < 6 * (2 / len(many)) ** 0.5
+    x = program_draws(model, 4000).mT.flatten(1)
+    mean, covariance, noise = joint(model)
+    total = covariance + torch.diag(noise)
+    white = torch.linalg.solve_triangular(torch.linalg.cholesky(total), (x - mean).T, upper=False)
+    assert white.mean(1).abs().max() < 6 / len(x) ** 0.5
+    second = white @ white.T / len(x) - torch.eye(len(white))
+    assert second.abs().max() < 6 * (2 / len(x)) ** 0.5
 
 
 def test_bands_cover_data_drawn_from_the_model():
-    model, _ = trained()
-    count = 1000
-    blank = Sequences.from_arrays(np.zeros((count, FRAMES, CHANNELS)), rate=30.0)
-    with seeded(2):
-        y = model(whole(blank)).detach()
-        x = y + model.noise * model.ratio.sqrt() * torch.randn_like(y)
+    model, _ = trained(plain=False)
+    model.information = torch.ones(()).double()
+    x = program_draws(model, 1000)
     drawn = Sequences.from_arrays(x.numpy(), rate=30.0)
     found = model.forecast(whole(drawn.first(9)), None, horizon=FRAMES - 9, draws=1)
-    std = (found.noise.square() + found.epistemic.square()).sqrt()[0, :, 10, 0]
-    inside = ((x[:, 19, 0] - found.location[0, :, 10, 0]) / std).abs() < 1.6448536
-    assert abs(float(inside.double().mean()) - 0.9) < 6 * (0.09 / count) ** 0.5
+    below = mixtures.cdf(found.location, found.spread, x[:, 9:])[:, 10, 0]
+    for level in (0.05, 0.25, 0.5, 0.75, 0.95):
+        error = float((below < level).double().mean()) - level
+        assert abs(error) < 5 * (level * (1 - level) / 1000) ** 0.5 + 0.01
 
 
 def generate(model, batch, **changes):
@@ -251,16 +325,38 @@ def generate(model, batch, **changes):
 
 
 def test_twice_the_way_to_the_goal_doubles_the_movement():
-    model, data = trained()
+    model, data = trained(least_amplitude=0.01)
     batch = whole(data[[2]])
     plain = generate(model, batch).location[0, 0]
     posterior = model._demonstrated(batch, 1)[0].population.mean[0]
     first, velocity, fitted = posterior[:, :3].T
-    assert (fitted - first).abs().min() > model.config.least_amplitude
+    size = plain.amax(0) - plain.amin(0)
+    assert ((fitted - first).abs() > model.config.least_amplitude * size).all()
     goal = first + 2 * (fitted - first)
     found = generate(model, batch, goal=goal[None]).location[0, 0]
     free = roll_out(model.primitive, FRAMES, Timing(FRAMES - 1.0))[:, 1:2] * velocity
     torch.testing.assert_close(found - first - free, 2 * (plain - first - free))
+
+
+def there_and_back(count=4):
+    """Movements that end near where they began, a tenth of their range away."""
+    time = np.linspace(0, 1, 60)[:, None]
+    loops = [np.sin(np.pi * time) * (1 + 0.05 * i) + 0.1 * time for i in range(count)]
+    return Sequences.from_arrays([np.concatenate([x, x[::-1]], 1) for x in loops], rate=30.0)
+
+
+def test_a_far_goal_is_told_of_and_neither_path_nor_bands_are_those_of_a_near_one():
+    data = there_and_back()
+    run = zoo.fit(zoo.create("dmp", data, scaling="none"), data)
+    end = data.values[0, -1].numpy()
+    near = run.generate(data[[0]], goal=end + 0.05)
+    with pytest.warns(ExtrapolationWarning, match=r"channel_1 to 1.5 .demonstrated 0 to 1.2"):
+        far = run.generate(data[[0]], goal=end + 1.5)
+    bend = [p.mean.diff(n=2, dim=1).abs().amax().item() for p in (near, far)]
+    assert bend[1] < 3 * bend[0]
+    assert (far.mean[0, -1] - torch.from_numpy(end + 1.5)).abs().max() < 0.1
+    widths = [p.std[0, 20:40].mean().item() for p in (near, far)]
+    assert widths[1] > 5 * widths[0]
 
 
 def test_longer_duration_is_the_same_path_more_slowly():

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from zoo.mixtures import Deferred
 
-__all__ = ["Components", "Paths", "alike", "ramp", "resample"]
+__all__ = ["Components", "Paths", "alike", "minimum_jerk", "ramp", "resample"]
 
 Draw = Callable[[int], Tensor]
 
@@ -113,3 +113,17 @@ def ramp(frames: int, start: int, steps: int) -> Float[Tensor, " step"]:
         )
     time = torch.arange(frames - 1, dtype=torch.float64)
     return ((time - start) / steps).clamp(0, 1)
+
+
+def minimum_jerk(frames: int, start: int = 0) -> Float[Tensor, " frame"]:
+    """A way from 0 at frame ``start`` to 1 at the last, at rest at both ends.
+
+    Flash & Hogan, *The coordination of arm movements*, Journal of Neuroscience 5 (1985).
+
+    >>> minimum_jerk(5).tolist()
+    [0.0, 0.103515625, 0.5, 0.896484375, 1.0]
+    """
+    time = torch.arange(frames, dtype=torch.float64)
+    s = ((time - start) / (frames - 1 - start)).clamp(0, 1)
+    way: Tensor = s**3 * (10 - 15 * s + 6 * s**2)
+    return way

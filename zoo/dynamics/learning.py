@@ -11,15 +11,22 @@ from torch import Tensor
 
 from zoo.dynamics.evidence import FLOOR, conjugate_weights
 from zoo.dynamics.imitation import locally_weighted_regression, target_force
-from zoo.dynamics.population import Population, estimate
+from zoo.dynamics.population import Population, Shares, estimate
 from zoo.dynamics.rollout import Primitive, Timing
+from zoo.dynamics.scales import student_scales
 from zoo.dynamics.sums import Movements, Sums, of_weights, square_after, sums_of
 from zoo.dynamics.timing import anchors, timings_of
 
 __all__ = ["Learned", "Learning", "learn"]
 
 RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
-SHRINKAGES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.0)
+SHARES = tuple(
+    Shares(alone, part) for alone in (0.02, 0.1, 0.3, 0.6, 1.0) for part in (0.0, 0.3, 1.0)
+)
+SCALES = {"discrete": 16, "rhythmic": 8}
+FEW = Shares(0.5, 0.5)
+LOW = 0.1
+INFORMATION = (1.0, 0.3, 0.1, 0.03, 0.01)
 FOLDS = 5
 NOISE_OF = {"path": 100.0, "force": 1e-4}
 
@@ -28,12 +35,18 @@ Learning = Literal["path", "force", "lwr"]
 
 @dataclass(frozen=True)
 class Learned:
-    """p(θ) with the residual variance σ² of every channel, ρ, and the timings that were seen."""
+    """p(θ) with the residual variance σ² of every channel, ρ, and the timings of the movements.
+
+    An entry counts as ``information`` of an independent one; ``scales`` are those of the t that a
+    population of few movements is.
+    """
 
     population: Population
     noise: Float[Tensor, " channel"]
     ratio: Float[Tensor, " channel"]
-    shrinkage: float
+    shares: Shares
+    information: float
+    scales: Float[Tensor, " scale"]
     timings: tuple[Timing, ...]
 
 
@@ -64,6 +77,9 @@ def learn(
         [anchors(primitive, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)]
     )
     floor = _floor(movements, timings, primitive.kernels)
+    scales = torch.ones(1, dtype=torch.float64)
+    if len(movements) > 1:
+        scales = student_scales(len(movements) - 1, SCALES[primitive.kind])
     ratios = _ratios(learning)
     shape = (-1, values.shape[2])
     every, begun = sums_of(primitive, ratios[:, None].expand(shape), movements, timings)
@@ -74,11 +90,11 @@ def learn(
         parameters, uncertainty = _weights(every.at(own), starts)
     fit, winner = _residuals(every, ratios, parameters, uncertainty)
     whole, early = every.of_channels(winner), begun.of_channels(winner)
-    shrinkage = _shrinkage(fit, whole, early, floor)
-    population = estimate(fit.parameters, fit.uncertainty, shrinkage, floor)
+    shares, information = _chosen(fit, whole, early, floor, scales)
+    population = estimate(fit.parameters, fit.uncertainty, shares, floor)
     if not all(bool(seen.all()) for _, seen in movements):
-        population = _refined(population, whole, fit.noise, shrinkage, floor)
-    return Learned(population, fit.noise, fit.ratio, shrinkage, tuple(timings))
+        population = _refined(population, whole, fit.noise, shares, floor)
+    return Learned(population, fit.noise, fit.ratio, shares, information, scales, tuple(timings))
 
 
 def _ratios(learning: Learning) -> Float[Tensor, " ratio"]:
@@ -143,24 +159,48 @@ def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
     return floor
 
 
-def _shrinkage(fit: _Fit, whole: Sums, early: Sums, floor: Tensor) -> float:
-    """The shrinkage that best foretells movements left out; 0.5 of fewer than three movements."""
+def _chosen(
+    fit: _Fit, whole: Sums, early: Sums, floor: Tensor, scales: Tensor
+) -> tuple[Shares, float]:
+    """Shares, and then information, that make movements left out most probable.
+
+    Shares are compared at a low information: at 1 they would make up for residuals that go together
+    over channels and time, which are no matter of movements' parameters.
+    """
     if len(fit.parameters) < 3:
-        return 0.5
-    return max(SHRINKAGES, key=lambda share: _foretold(fit, whole, early, share, floor))
+        return FEW, 1.0
+    left_out = _LeftOut(fit, whole, early, floor)
+    usual = torch.ones_like(scales[:1])
+    shares = max(SHARES, key=lambda s: left_out.density(s, LOW, usual))
+    return shares, max(INFORMATION, key=lambda c: left_out.density(shares, c, scales))
 
 
-def _foretold(fit: _Fit, whole: Sums, early: Sums, shrinkage: float, floor: Tensor) -> float:
-    """Log density of the later three quarters of movements left out, given their first."""
-    count, score = len(fit.parameters), 0.0
-    folds = torch.arange(count) % min(FOLDS, count)
-    for fold in folds.unique():
-        rows = (folds == fold).nonzero()[:, 0]
-        population = estimate(fit.parameters[folds != fold], fit.uncertainty, shrinkage, floor)
-        for sums, sign in ((whole, 1), (early, -1)):
-            evidence = population.log_evidence(*_likelihood(sums.of_movements(rows), fit.noise))
-            score += sign * float(evidence.sum())
-    return score
+@dataclass(frozen=True)
+class _LeftOut:
+    """Movements in folds, each under the population of the others."""
+
+    fit: _Fit
+    whole: Sums
+    early: Sums
+    floor: Tensor
+
+    def density(self, shares: Shares, information: float, scales: Tensor) -> float:
+        """Log density of the later three quarters of movements left out, given their first."""
+        count, score = len(self.fit.parameters), 0.0
+        folds = torch.arange(count) % min(FOLDS, count)
+        for fold in folds.unique():
+            parameters = self.fit.parameters[folds != fold]
+            population = estimate(parameters, self.fit.uncertainty, shares, self.floor)
+            score += self._density(population.scaled(scales), folds == fold, information)
+        return score
+
+    def _density(self, population: Population, rows: Tensor, information: float) -> float:
+        a, b = _likelihood(self.early.of_movements(rows), self.fit.noise)
+        whole_a, whole_b = _likelihood(self.whole.of_movements(rows), self.fit.noise)
+        known = (information * a, information * b)
+        later = (whole_a - a + known[0], whole_b - b + known[1])
+        both, first = (population.log_evidence(*part).logsumexp(0) for part in (later, known))
+        return float((both - first).sum())
 
 
 def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,9 +208,9 @@ def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _refined(
-    population: Population, whole: Sums, noise: Tensor, shrinkage: float, floor: Tensor
+    population: Population, whole: Sums, noise: Tensor, shares: Shares, floor: Tensor
 ) -> Population:
     """The population again, from parameters that it completed itself where frames were missing."""
     part = population.condition(*_likelihood(whole, noise))
     spread = part.private @ part.private.mT + part.factors @ part.factors.mT
-    return estimate(part.mean, spread.mean(0), shrinkage, floor)
+    return estimate(part.mean, spread.mean(0), shares, floor)

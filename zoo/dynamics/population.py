@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Population", "estimate"]
+__all__ = ["Population", "Shares", "estimate"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,13 @@ class Population:
     mean: Float[Tensor, "*#sequence channel parameter"]
     factors: Float[Tensor, "*#sequence channel parameter factor"]
     private: Float[Tensor, "*#sequence channel parameter parameter"]
+
+    @classmethod
+    def fixed(cls, parameters: Float[Tensor, "sequence channel parameter"]) -> Population:
+        """Parameters that are known."""
+        shape = parameters.shape
+        alone = parameters.new_zeros(*shape, shape[-1])
+        return cls(parameters, parameters.new_zeros(*shape, 0), alone)
 
     def condition(
         self,
@@ -52,6 +59,33 @@ class Population:
         private = (solved.error * _times(solved.gain, solved.error)).sum((-1, -2)) / 2
         shared = (solved.shared_linear * solved.shared_mean).sum(-1) / 2
         return at_mean + private + shared - solved.log_volume
+
+    def scaled(self, scale: Float[Tensor, " scale"]) -> Population:
+        """The populations with s times the deviations, for every s along a first axis."""
+        s = scale[:, None, None, None, None]
+        return Population(self.mean, s * self.factors, s * self.private)
+
+    def shared_posterior(
+        self,
+        precision: Float[Tensor, "*batch #channel parameter parameter"],
+        linear: Float[Tensor, "*batch channel parameter"],
+    ) -> tuple[Float[Tensor, "*batch factor"], Float[Tensor, "*batch factor factor"]]:
+        """Mean of p(a | x) and a root Q of its precision, Q Qᵀ."""
+        solved = _solve(self, precision, linear)
+        return solved.shared_mean, solved.shared_root
+
+    def private_posterior(
+        self,
+        precision: Float[Tensor, "*batch #channel parameter parameter"],
+        linear: Float[Tensor, "*batch channel parameter"],
+        shared: Float[Tensor, "*batch factor"],
+    ) -> tuple[Tensor, Tensor]:
+        """Mean of p(V⁻¹δ | a, x) and a root Q of its precision, Q Qᵀ."""
+        v, eye = self.private, torch.eye(self.private.shape[-1], dtype=linear.dtype)
+        θ = self.mean + _times(self.factors, shared[..., None, :])
+        root = torch.linalg.cholesky(eye + v.mT @ precision @ v)
+        pull = _times(v.mT, linear - _times(precision, θ))
+        return torch.cholesky_solve(pull[..., None], root)[..., 0], root
 
     def affine(
         self, scale: Float[Tensor, "*sequence channel parameter"], shift: Tensor
@@ -88,18 +122,30 @@ class Population:
         return self.mean + _times(self.factors, a) + _times(self.private, white)
 
 
+@dataclass(frozen=True)
+class Shares:
+    """What of the covariance over movements every channel has alone, and of that every parameter.
+
+    The sample covariance of n movements has rank n − 1: under it alone a few frames would settle
+    the rest of the movement.
+    """
+
+    alone: float
+    independent: float
+
+
 def estimate(
     parameters: Float[Tensor, "sequence channel parameter"],
     uncertainty: Float[Tensor, "channel parameter parameter"],
-    shrinkage: float,
+    shares: Shares,
     floor: Float[Tensor, " parameter"],
 ) -> Population:
-    """Population of several movements, its covariance shrunk towards independent channels.
+    """Population of several movements, its covariance shrunk towards independent parameters.
 
-    The sample covariance over movements, of rank one less than their number, keeps the share
-    1 − ``shrinkage``; the rest goes to every channel alone, with a shape pooled over channels and
-    each channel's own size. ``uncertainty`` of the single estimates and the variance ``floor`` are
-    added to every channel. A new movement is 1 + 1/count times as far from the estimated mean.
+    The sample covariance over movements keeps the share 1 − ``alone``. The rest goes to every
+    channel alone, with a shape pooled over channels and each channel's own size; of that shape only
+    the diagonal keeps the share ``independent``. ``uncertainty`` of the single estimates and the
+    variance ``floor`` are added. A new movement is 1 + 1/count times as far from the mean.
     """
     count, channels, _ = parameters.shape
     mean = parameters.mean(0)
@@ -111,8 +157,9 @@ def estimate(
     size = deviation.square().sum((0, 2)).clamp_min(torch.finfo(mean.dtype).tiny)
     scaled = deviation / size.sqrt()[:, None]
     shape = torch.einsum("scp,scq->pq", scaled, scaled) / channels
-    private = private + shrinkage * size[:, None, None] * shape
-    factors = (1 - shrinkage) ** 0.5 * deviation.permute(1, 2, 0)
+    shape = torch.lerp(shape, torch.diag(shape.diagonal()), shares.independent)
+    private = private + shares.alone * size[:, None, None] * shape
+    factors = (1 - shares.alone) ** 0.5 * deviation.permute(1, 2, 0)
     return Population(mean, factors, _root(private))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -61,6 +62,12 @@ class Sums:
         wide = [_expanded(p, a, len(ratio)) for p, a in zip(self.parts, CHANNEL, strict=True)]
         first = [p.movedim(a, 1)[ratio, channel] for p, a in zip(wide, CHANNEL, strict=True)]
         return Sums(*(p.movedim(0, a) for p, a in zip(first, CHANNEL, strict=True)))
+
+    def log_density(self, variance: Float[Tensor, " channel"]) -> Float[Tensor, " sequence"]:
+        """log p(x | θ = 0), of channels with variance σ²."""
+        white = self.square / variance + self.count * (2 * math.pi * variance).log()
+        density: Tensor = -(white / 2 + self.log_volume).sum(-1)
+        return density
 
     def of_movements(self, rows: Shaped[Tensor, " some"]) -> Sums:
         """Those of some movements."""

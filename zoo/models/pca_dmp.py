@@ -9,10 +9,10 @@ import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
-from pyro import poutine
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
+from zoo.dynamics.alignment import extremes
 from zoo.models import dmp, pca
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -46,24 +46,27 @@ class Config:
 
 
 class PcaDmp(nn.Module):
-    """Every principal component of the frames is one movement primitive, found in two exact steps.
+    """Every principal component of the frames is one movement primitive, found in two stages.
 
     z_t ~ one primitive a component, as in ``dmp``;  x_t ~ N(W z_t + μ, σ²I) as in ``pca``
 
     Thesis Table 2, where it is the linear rival of ``ae-dmp``; Bitzer & Vijayakumar, *Latent spaces
     for dynamic movement primitives*, Humanoids 2009, take the two steps apart in the same way. Both
     parts are those of the zoo and are learned one after the other: the components know nothing of
-    time, the primitives nothing of what the components leave out. Forecasts, missing sections,
-    goals, durations and switching are those of ``dmp`` in the components, brought back by W. Frames
-    with missing joints enter by the mean of p(z_t | x_seen), whose spread is not passed on. Draws
-    keep what components have in common; the closed-form spread counts them as independent. What
-    the components leave out is white noise to it, where in truth it is smooth.
+    time, the primitives nothing of what the components leave out. Each stage is in closed form;
+    both together are no exact inference in the joint program, and there is no guide. Forecasts,
+    missing sections, goals, durations and switching are those of ``dmp`` in the components, brought
+    back by W. Frames with missing joints enter by the mean of p(z_t | x_seen), whose variance is
+    not passed on. Draws keep what components have in common; the closed-form variance counts them
+    as independent. What the components leave out is white noise to it, where in truth it is smooth.
 
     Defaults: 5 components, 20 kernels (§5.3.2), α = 25, β = α/4.
     """
 
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float64
+
+    reached: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """Both parts without data."""
@@ -73,6 +76,7 @@ class PcaDmp(nn.Module):
         latent = replace(layout, channels=names, units=("",) * len(names))
         self.pca = pca.PCA(layout, config.pca)
         self.dmp = dmp.DMP(latent, config.dmp)
+        self.register_buffer("reached", torch.empty(0, dtype=self.dtype))
         self.phased = self.dmp.phased
 
     def condition(self, data: Sequences | Pairs) -> None:
@@ -80,6 +84,7 @@ class PcaDmp(nn.Module):
         if not isinstance(data, Sequences):
             raise TypeError(f"pca-dmp needs Sequences; got {type(data).__name__}")
         self.pca.condition(data)
+        self.reached = extremes(data.values, data.mask)
         z, mask = self._components(data.values, data.mask)
         latent = self.dmp.layout
         self.dmp.condition(
@@ -89,16 +94,15 @@ class PcaDmp(nn.Module):
     def forward(self, batch: Batch) -> Float[Tensor, "sequence frame channel"]:
         """The generative program of the whole movements of ``batch``."""
         z, mask = self._components(batch.movements, batch.movement_mask)
-        with poutine.block(hide=["x"]):
-            path = self.dmp(replace(batch, movements=z, movement_mask=mask))
-        mean: Tensor = path @ self.pca.loading.T + self.pca.mean
-        σ = self._noise(self._white)
-        rows = torch.arange(len(batch.movements))
-        with pyro.plate("frames", size=batch.total_sequences, subsample=rows):
-            x = dist.Normal(mean, σ)
+        latent = replace(batch, movements=z, movement_mask=mask)
+        with self.dmp.movements(latent):
+            law, _ = self.dmp.prior(latent)
+            path = pyro.sample("z", law)
+            mean: Tensor = path @ self.pca.loading.T + self.pca.mean
+            x = dist.Normal(mean, self.pca.noise)
             if batch.movement_mask is not None:
                 x = x.mask(batch.movement_mask)
-            pyro.sample("x", x.to_event(2), obs=batch.movements)
+            pyro.sample("x", x.to_event(2), obs=batch.given(batch.movements))
         return mean
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:

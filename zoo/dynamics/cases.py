@@ -1,0 +1,178 @@
+"""Timing and scale of a movement as discrete unknowns, with its parameters exact given these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import pyro.distributions as dist
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from zoo.dynamics.components import alike, resample
+from zoo.dynamics.movement_law import Noise
+from zoo.dynamics.population import Population
+from zoo.dynamics.rollout import Primitive, Timing
+from zoo.dynamics.sums import Sight, Sums, sights
+
+__all__ = ["Case", "Cases", "Posteriors"]
+
+Drawn = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Movements with the same entries observed and one timing: p(θ | x) of each."""
+
+    population: Population
+    sight: Sight
+    timing: Timing
+    x: Float[Tensor, "sequence time channel"]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Movements with the same entries observed, at every timing."""
+
+    rows: Int[Tensor, " some"]
+    x: Float[Tensor, "some time channel"]
+    sights: list[Sight]
+    sums: list[Sums]
+
+
+@dataclass(frozen=True)
+class Cases:
+    """Equally likely timings and scales s of the deviations from the mean movement.
+
+    Every entry counts as ``information`` of an independent one.
+    """
+
+    primitive: Primitive
+    population: Population
+    noise: Noise
+    information: float
+    timings: Sequence[Timing]
+    scales: Float[Tensor, " scale"]
+
+    def groups(
+        self,
+        values: Float[Tensor, "sequence time channel"],
+        seen: Bool[Tensor, "sequence time channel"],
+    ) -> Iterator[Group]:
+        """What the movements say of θ; the errors of timings of one tempo are the same."""
+        for rows, mask in alike(seen):
+            x = values[rows] * mask
+            views = sights(self.primitive, self.timings, self.noise.ratio, mask)
+            first = {t.unit: v for t, v in zip(self.timings, views, strict=True)}
+            errors = {unit: view.errors(x) for unit, view in first.items()}
+            pairs = zip(self.timings, views, strict=True)
+            yield Group(rows, x, views, [v.sums(errors[t.unit], *x.shape[:2]) for t, v in pairs])
+
+    def likelihood(self, sums: Sums) -> tuple[Tensor, Tensor]:
+        """Precision and linear term of θ."""
+        weight = self.information / self.noise.std.square()
+        return sums.precision * weight[:, None, None], sums.linear * weight[:, None]
+
+    def evidence(self, group: Group) -> Float[Tensor, "timing scale sequence"]:
+        """log ∫ p(θ) p(x | θ)^information dθ of every timing and scale."""
+        scaled, variance = self.population.scaled(self.scales), self.noise.std.square()
+        fits = [scaled.log_evidence(*self.likelihood(s)) for s in group.sums]
+        at_zero = [self.information * s.log_density(variance) for s in group.sums]
+        pairs = zip(at_zero, fits, strict=True)
+        return torch.stack([zero + fit for zero, fit in pairs])
+
+    def likeliest(self, group: Group) -> Int[Tensor, " some"]:
+        """The likeliest timing of every movement."""
+        if len(self.timings) == 1:
+            return torch.zeros_like(group.rows)
+        return self.evidence(group).logsumexp(1).argmax(0)
+
+    def chosen(
+        self, values: Tensor, seen: Tensor, count: int
+    ) -> Iterator[tuple[Tensor, Tensor, Case]]:
+        """Timings and scales resampled to ``count``: rows, which components they are, p(θ | x).
+
+        One alone is the likeliest timing, with the usual scale: whole movements tell their θ.
+        """
+        for group in self.groups(values, seen):
+            if count == 1:
+                picks = self.likeliest(group)[None]
+            else:
+                picks = resample(self.evidence(group).flatten(0, 1), count)
+            for i in picks.unique().tolist():
+                some, one = (picks == i).any(0), self.scales.new_ones(())
+                timing, scale = divmod(i, 1 if count == 1 else len(self.scales))
+                s = one if count == 1 else self.scales[scale]
+                yield group.rows[some], picks[:, some] == i, self.case(group, timing, s, some)
+
+    def case(self, group: Group, timing: int, scale: Tensor, some: Tensor) -> Case:
+        """p(θ | x) of some movements of a group."""
+        prior, x = self._scaled(scale), group.x[some]
+        posterior = prior.condition(*self.likelihood(group.sums[timing].of_movements(some)))
+        return Case(posterior, group.sights[timing], self.timings[timing], x)
+
+    def _scaled(self, scale: Tensor) -> Population:
+        p = self.population
+        return Population(p.mean, scale * p.factors, scale * p.private)
+
+
+class Posteriors:
+    """p(timing | x), p(scale | timing, x) and p(θ | timing, scale, x) of some movements."""
+
+    def __init__(self, cases: Cases, x: Tensor, seen: Tensor) -> None:
+        """Weigh every timing and scale of every movement."""
+        self.cases, self.groups = cases, list(cases.groups(x, seen))
+        self.evidence = x.new_empty(len(cases.timings), len(cases.scales), len(x))
+        for group in self.groups:
+            self.evidence[..., group.rows] = cases.evidence(group)
+
+    def log_evidence(self) -> Float[Tensor, " sequence"]:
+        """Log of the likelihood, integrated over everything."""
+        count = self.evidence.shape[0] * self.evidence.shape[1]
+        total: Tensor = self.evidence.flatten(0, 1).logsumexp(0) - math.log(count)
+        return total
+
+    def timing(self, _: Drawn) -> dist.TorchDistribution:
+        """p(timing | x)."""
+        return dist.Categorical(logits=self.evidence.logsumexp(1).mT)
+
+    def scale(self, drawn: Drawn) -> dist.TorchDistribution:
+        """p(scale | timing, x)."""
+        timing = drawn["timing"]
+        rows = torch.arange(self.evidence.shape[2]).expand_as(timing)
+        return dist.Categorical(logits=self.evidence[timing, :, rows])
+
+    def shared(self, drawn: Drawn) -> dist.TorchDistribution:
+        """p(a | timing, scale, x)."""
+        a, b, p = self._given(drawn)
+        mean, root = p.shared_posterior(a, b)
+        return dist.MultivariateNormal(mean, precision_matrix=root @ root.mT)
+
+    def private(self, drawn: Drawn) -> dist.TorchDistribution:
+        """p(V⁻¹δ | a, timing, scale, x)."""
+        a, b, p = self._given(drawn)
+        none = b.new_zeros(*b.shape[:-2], p.factors.shape[-1])
+        mean, root = p.private_posterior(a, b, drawn.get("shared", none))
+        white = dist.MultivariateNormal(mean, precision_matrix=root @ root.mT)
+        law: dist.TorchDistribution = white.to_event(1)
+        return law
+
+    def _given(self, drawn: Drawn) -> tuple[Tensor, Tensor, Population]:
+        """Likelihood and prior of the timings and scales drawn, for every movement."""
+        timing, (channels, parameters) = drawn["timing"], self.cases.population.mean.shape
+        linear = self.evidence.new_empty(*timing.shape, channels, parameters)
+        precision = linear.new_empty(*linear.shape, parameters)
+        for group in self.groups:
+            chosen = timing[..., group.rows]
+            for i in chosen.unique().tolist():
+                *lead, which = (chosen == i).nonzero(as_tuple=True)
+                index = (*lead, group.rows[which])
+                precision[index], linear[index] = self._likelihood(group.sums[i], which)
+        s = self.cases.scales[drawn["scale"]][..., None, None, None]
+        p = self.cases.population
+        return precision, linear, Population(p.mean, s * p.factors, s * p.private)
+
+    def _likelihood(self, sums: Sums, which: Tensor) -> tuple[Tensor, Tensor]:
+        return self.cases.likelihood(sums.of_movements(which))
