@@ -304,6 +304,15 @@ def test_too_little_data_is_named() -> None:
     assert alone.fold.tolist() == [0, 1]
 
 
+def test_wide_data_have_a_short_memory() -> None:
+    """p times the channels bounds the matrices whose eigenvalues and inverses are needed."""
+    values = list(np.random.default_rng(0).normal(size=(3, 12, 600)))
+    data = Sequences.from_arrays(values, rate=30.0)
+    model = Autoregression(data.layout, Config(ridge=1.0))
+    found = model._choices(model._trials(data), data.channels)
+    assert {choice.order for choice in found} == {1, 2}
+
+
 @real
 def test_on_real_walks_it_is_no_worse_than_a_ridge_ar_2_chosen_by_cross_validation() -> None:
     """Setup 2's question: 100 frames observed and 200 to forecast, less training means only."""

@@ -31,6 +31,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["Autoregression", "Config"]
 
 ORDERS = (1, 2, 4, 8, 16)
+STATE = 1600
 RUNS = 5
 
 
@@ -92,7 +93,8 @@ class Autoregression(nn.Module):
 
     It is a baseline, not in the thesis, and it has no guide: there is no latent variable.
 
-    Defaults: all chosen; p of 1, 2, 4, 8 and 16; data standardised.
+    Defaults: all chosen; p of 1, 2, 4, 8 and 16, as far as p times the channels is at most 1,600;
+    data standardised.
     """
 
     config_class: ClassVar[type] = Config
@@ -242,7 +244,8 @@ class Autoregression(nn.Module):
     def _choices(self, trials: Trials, channels: tuple[str, ...]) -> list[Choice]:
         """What the settings leave open and the data allow."""
         config, frames = self.config, trials.values.shape[1]
-        orders = [p for p in ORDERS if 2 * p < frames] if config.order is None else [config.order]
+        most = min((frames - 1) // 2, max(1, STATE // len(channels)))
+        orders = [p for p in ORDERS if p <= most] if config.order is None else [config.order]
         couplings = ["channel", "vector"] if config.coupling is None else [config.coupling]
         ridges = RIDGES if config.ridge is None else (config.ridge,)
         pairs = [(p, c == "vector") for p in orders for c in couplings]
