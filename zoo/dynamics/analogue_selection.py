@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zoo.dynamics.analogues import error_sums
-from zoo.dynamics.chain_selection import places
+from zoo.dynamics.folds import places, starts
 from zoo.dynamics.re_entry import Align, Library, Places, dips
 
 __all__ = ["Choice", "Options", "Trials", "forecast"]
@@ -60,7 +60,7 @@ class Trials:
         """The combination with the least squared error of forecasts, begun early and late."""
         frames = self.library.values.shape[1]
         total: dict[Choice, float] = {}
-        for k in sorted({min(3, frames // 2), frames // 4, frames // 2, 3 * frames // 4} - {0}):
+        for k in starts(frames):
             for trial in self._continued(k, options):
                 futures, offsets = trial.futures.cumsum(0), trial.offsets.cumsum(0)
                 for n in options.neighbours:

@@ -10,21 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zoo.dynamics.chains import Chain, chain, lags_up_to, sums_of_runs, unexplained
+from zoo.dynamics.folds import places, starts
 
-__all__ = ["Choice", "Course", "Trials", "folds_of", "places"]
+__all__ = ["RIDGES", "Choice", "Course", "Trials"]
 
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-FOLDS = 4
-
-
-def folds_of(group: Int[Tensor, " sequence"]) -> Int[Tensor, " sequence"]:
-    """At most four folds, whole groups in turn.
-
-    >>> folds_of(torch.tensor([7, 7, 2, 5, 9, 1])).tolist()
-    [0, 0, 1, 2, 3, 0]
-    """
-    order = list(dict.fromkeys(group.tolist()))
-    return group.new_tensor([order.index(g) % FOLDS for g in group.tolist()])
 
 
 @dataclass(frozen=True)
@@ -137,7 +127,7 @@ class Trials:
         sums = self.sums(order, jointly)
         for f in range(int(self.fold.max()) + 1):
             part = chain([s.sum(0) - s[f] for s in sums], lags_up_to(order), ridge)
-            for k in sorted({min(3, frames // 2), frames // 4, frames // 2, 3 * frames // 4} - {0}):
+            for k in starts(frames):
                 error, asked = self._missed(part, f, k)
                 squares += error.square().flatten(1).sum(1)
                 count += float(asked.sum())
@@ -149,15 +139,6 @@ class Trials:
         x, asked = self.values[rows], self.mask[rows, known:]
         error = part.rolled(x[:, :known], x.shape[1] - known) - x[:, known:]
         return error * asked, asked
-
-
-def places(first: int, last: int, count: int) -> list[int]:
-    """Numbers evenly spaced between two.
-
-    >>> places(0, 9, 4)
-    [0, 3, 6, 9]
-    """
-    return sorted({round(first + i * (last - first) / max(count - 1, 1)) for i in range(count)})
 
 
 def _smooth(sums: Float[Tensor, " lead"], count: Float[Tensor, " lead"]) -> Float[Tensor, " lead"]:

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from zoo.datasets.records import Pairs, Sequences
 from zoo.dynamics.analogues import interpolated
 from zoo.dynamics.banded import conditional, precision
-from zoo.dynamics.chain_selection import RIDGES, Choice, Trials, folds_of, places
+from zoo.dynamics.chain_selection import RIDGES, Choice, Trials
 from zoo.dynamics.chains import Chain
 from zoo.dynamics.components import alike
+from zoo.dynamics.folds import folds_of, places
 from zoo.models.baseline import (
     check_fitted,
     moments,

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from zoo.datasets.records import Pairs, Sequences
 from zoo.dynamics.analogue_selection import Choice, Options, Trials, forecast
 from zoo.dynamics.analogues import carried, error_sums, interpolated
-from zoo.dynamics.chain_selection import folds_of, places
+from zoo.dynamics.folds import folds_of, places
 from zoo.dynamics.gaps import Gaps
 from zoo.dynamics.re_entry import ALIGNMENTS, Align, Library
 from zoo.models.baseline import (
