@@ -55,7 +55,17 @@ def test_goals_are_one_for_all_or_one_for_each(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["vae-dmp", "vae-dmp-rhythmic", "ae-dmp", "dmp", "dmp-rhythmic", "pca-dmp"]
+    "name",
+    [
+        "vae-dmp",
+        "vae-dmp-rhythmic",
+        "ae-dmp",
+        "dmp",
+        "dmp-rhythmic",
+        "pca-dmp",
+        "promp",
+        "promp-rhythmic",
+    ],
 )
 def test_a_goal_far_beyond_the_demonstrations_is_told_of(name: str) -> None:
     """0.3 of a joint's range too far; within a twentieth nothing."""

@@ -195,7 +195,7 @@ def test_a_goal_is_the_conditional_of_the_population_moved_onto_the_demonstratio
     metric = Weights(normal(10), normal(10, 10, seed=1) / 3)
     basis = Basis(normal(7, 5, seed=2), torch.eye(2, dtype=torch.float64))
     demonstration, goal = Weights(normal(1, 10, seed=3), 0 * metric.root), normal(2, seed=4)
-    moved = demonstration.moved(basis, goal, metric.covariance)
+    moved = demonstration.moved(basis, goal, metric, 0.0)
     ends = basis.path(torch.eye(10, dtype=torch.float64))[:, [0, -1]].flatten(1)
     wanted = torch.cat([demonstration.mean[0] @ ends[:, :2], goal])
     exact = Weights(demonstration.mean, metric.root).condition(

@@ -226,3 +226,56 @@ def test_nothing_of_a_movement_left_out_is_used_before_it_is_judged(
     assert torch.equal(first.single.target, again.single.target)
     assert torch.equal(first.single.variance, again.single.variance)
     assert torch.equal(first.synergies, again.synergies)
+
+
+def reaches(count: int, seed: int, goals: int = 0) -> Sequences:
+    """Smooth reaches from one place to several, with a bend of their own."""
+    rng, time = np.random.default_rng(seed), np.linspace(0, 1, 40)[:, None]
+    way = time**3 * (10 - 15 * time + 6 * time**2)
+    bend = rng.normal(size=(count, 1, 2)) * np.sin(np.pi * time) ** 2
+    ends = np.random.default_rng((seed, goals)).normal([2, -3], 0.5, size=(count, 1, 2))
+    values = ends * way + 0.3 * bend
+    return Sequences.from_arrays(values + 1e-3 * rng.normal(size=values.shape), rate=30.0)
+
+
+def generated(model: ProMP, like: Sequences, goal: torch.Tensor):
+    """Path and standard deviation of demonstrations that are to end elsewhere."""
+    answer = model.generate(
+        whole(like), None, goal=goal, duration=1.0, onto=None, start=0, steps=1, draws=2
+    )
+    return answer.location[0], (answer.epistemic.square() + answer.noise.square()).sqrt()[0]
+
+
+def test_far_goals_neither_throw_the_path_nor_stay_sure_of_it():
+    train = reaches(10, 0)
+    model = ProMP(train.layout, Config(kernels=12))
+    model.condition(train)
+    like, ends = train[:5], train.values[:5, -1]
+    width = train.values.amax((0, 1)) - train.values.amin((0, 1))
+
+    def size(path):
+        return (path.amax(1) - path.amin(1)).mean()
+
+    def acceleration(path):
+        return path.diff(n=2, dim=1).square().mean().sqrt()
+
+    same, first = generated(model, like, ends)
+    widths = [first.mean()]
+    for beyond, most in ((0.1, 1.2), (0.3, 1.6)):
+        path, spread = generated(model, like, ends + beyond * width * ends.sign())
+        torch.testing.assert_close(path[:, -1], ends + beyond * width * ends.sign())
+        torch.testing.assert_close(path[:, 0], same[:, 0])
+        assert size(path) < most * size(like.values)
+        assert acceleration(path) < most * acceleration(same)
+        widths.append(spread.mean())
+    assert widths[1] > 2 * widths[0] and widths[2] > 2 * widths[1]
+
+
+def test_bands_of_another_goal_hold_the_same_movement_to_there():
+    train, others = reaches(12, 1), reaches(12, 1, goals=1)
+    model = ProMP(train.layout, Config(kernels=12))
+    model.condition(train)
+    path, spread = generated(model, train, others.values[:, -1])
+    inside = ((others.values - path).abs() < 1.645 * spread).double()[:, 5:-3]
+    assert float(inside.mean()) > 0.85
+    assert float(spread[:, 5:-3].mean()) < float(train.values[:, 5:-3].std(0).mean())

@@ -108,14 +108,25 @@ class Weights:
         return Weights(self.mean @ matrix.mT + shift, matrix @ self.root)
 
     def moved(
-        self, basis: Basis, goal: Float[Tensor, " channel"], metric: Float[Tensor, "weight weight"]
+        self, basis: Basis, goal: Float[Tensor, " channel"], population: Weights, smooth: float
     ) -> Weights:
-        """w + ΣHᵀ(HΣHᵀ)⁺ (0, g − y_T): nearest in ``metric`` Σ, with the same first frame."""
+        """w + MHᵀ(HMHᵀ)⁺ (0, g − y_T): nearest in the metric M, with the same first frame.
+
+        M is the population's Σ with, for every synergy, ``smooth`` of its mean variance along the
+        path of least jerk from 0 to 1, which leads to goals that Σ says nothing of. How M varies
+        about that is added, as many times as the mean square of g − y_T in the units of M.
+        """
+        metric = population.covariance + smooth * _jerkless(basis, population)
         eye = torch.eye(len(metric), dtype=metric.dtype, device=metric.device)
         ends = basis.path(eye)[:, [0, -1]].flatten(1).mT
         inner = torch.linalg.pinv(ends @ metric @ ends.mT, rtol=1e-9, hermitian=True)
-        gain = (metric @ ends.mT @ inner)[:, len(goal) :]
-        return self.affine(eye - gain @ ends[len(goal) :], gain @ goal)
+        gain = metric @ ends.mT @ inner
+        last = ends[len(goal) :]
+        change = goal - self.mean @ last.mT
+        found = self.affine(eye - gain[:, len(goal) :] @ last, gain[:, len(goal) :] @ goal)
+        far = change @ inner[len(goal) :, len(goal) :] @ change.mT / len(goal)
+        rest = (eye - gain @ ends) @ torch.linalg.cholesky(metric)
+        return Weights(found.mean, torch.cat([found.root, far.diagonal().mean().sqrt() * rest], 1))
 
     def centred(self, basis: Basis, goal: Float[Tensor, " channel"]) -> Weights:
         """Every synergy's weights about a new centre: those of a basis whose rows sum to one."""
@@ -153,6 +164,18 @@ class Weights:
     def _posterior_root(self, inner: Tensor) -> Tensor:
         turned: Tensor = torch.linalg.solve_triangular(inner, self.root.mT, upper=False)
         return turned.mT
+
+
+def _jerkless(basis: Basis, population: Weights) -> Float[Tensor, "weight weight"]:
+    """Every synergy's mean variance, along its path of least jerk (Flash & Hogan, 1985)."""
+    kernels, synergies = basis.phases.shape[1], basis.synergies.shape[1]
+    s = torch.linspace(0, 1, len(basis.phases), dtype=basis.phases.dtype)
+    path = s**3 * (10 - 15 * s + 6 * s**2)
+    φ = basis.phases
+    gram = φ.mT @ φ + 1e-9 * torch.eye(kernels, dtype=φ.dtype)
+    p = torch.linalg.solve(gram, φ.mT @ path)
+    size = population.covariance.diagonal().view(synergies, kernels).mean(1)
+    return torch.kron(size.diag(), torch.outer(p, p))
 
 
 def superposed(terms: Sequence[tuple[Basis, Weights, Float[Tensor, " time"]]]) -> Paths:

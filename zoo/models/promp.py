@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.dynamics.alignment import align, durations
+from zoo.dynamics.alignment import align, durations, extremes
 from zoo.dynamics.components import Components, Paths, ramp
 from zoo.dynamics.cross_fitting import Choice, Prepared, choose, inflation
 from zoo.dynamics.dmp import discrete_basis, rhythmic_basis
@@ -36,6 +36,7 @@ __all__ = ["Config", "ProMP"]
 
 COMPONENTS = 16
 TEMPOS, PHASES = 9, 32
+SMOOTH = 1.0
 SCALES = {"discrete": 16, "rhythmic": 4}
 
 
@@ -108,9 +109,10 @@ class ProMP(nn.Module):
     Forecasts and filled gaps are the posterior predictive, at durations of training movements that
     last as long, resampled to 16 components. A reconstruction, and a demonstration that is to be
     changed, count every entry whole, at the likeliest timing. Another goal moves a demonstration
-    along Σ, its first frame kept: the nearest weights that end there (rhythmic: about another
-    centre). Another duration stretches the phase; switching blends two paths linearly, so that
-    joint draws exist, instead of Paraschos' product of densities.
+    along Σ and along the path of least jerk, its first frame kept: the nearest weights that end
+    there (rhythmic: about another centre); bands grow with the distance. Another duration stretches
+    the phase; switching blends two paths linearly, so that joint draws exist, instead of
+    Paraschos' product of densities.
     ``epistemic`` is the uncertainty of the path, ``noise`` that of the observation.
 
     It cannot leave the span of its basis, learn from one movement, or reach a goal beyond its
@@ -129,6 +131,7 @@ class ProMP(nn.Module):
     scales: Tensor
     units: Tensor
     offsets: Tensor
+    reached: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """Placeholders until :meth:`condition`."""
@@ -136,7 +139,8 @@ class ProMP(nn.Module):
         self.phased = config.kind == "discrete"
         self.layout, self.config = layout, config
         moments = ("mean", "root", "noise", "synergies", "offset")
-        for name in (*moments, "shrinkage", "information", "scales", "units", "offsets"):
+        learned = ("shrinkage", "information", "scales", "units", "offsets", "reached")
+        for name in (*moments, *learned):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
 
     @property
@@ -152,6 +156,7 @@ class ProMP(nn.Module):
             raise ValueError("promp needs at least 2 movements for their spread; got 1")
         rows = zip(movements.values, movements.mask, movements.lengths.tolist(), strict=True)
         inside = [(x[:n], seen[:n]) for x, seen, n in rows]
+        self.reached = extremes(movements.values, movements.mask)
         prepare = partial(self._prepared, inside, movements.rate)
         group, c = movement_groups(movements), self.config
         chosen = choose(prepare, inside, group, c.shrinkage, c.information)
@@ -317,7 +322,7 @@ class ProMP(nn.Module):
     def _moved(self, weights: Weights, basis: Basis, goal: Tensor) -> Weights:
         if self.config.kind == "rhythmic":
             return weights.centred(basis, goal)
-        return weights.moved(basis, goal, self.weights.covariance)
+        return weights.moved(basis, goal, self.weights, SMOOTH)
 
     def _whole(self, frames: int) -> list[Timing]:
         """Possible timings of a complete movement of ``frames`` frames."""
