@@ -132,10 +132,10 @@ def agreement(kernels: int = KERNELS) -> dict[str, float]:
     }
 
 
-def main(rounds: int = 20) -> None:
+def main(rounds: int = 15) -> None:
     """Measure, print and store."""
     torch.set_num_threads(1)
-    found = {str(count): measure(count, rounds if count == 1 else 5) for count in (1, MANY)}
+    found = {str(count): measure(count, rounds if count == 1 else 3) for count in (1, MANY)}
     one, many = found["1"], found[str(MANY)]
     card = {
         "model": "dmp",
