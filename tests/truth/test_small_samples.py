@@ -10,6 +10,7 @@ from scipy import stats
 import zoo
 from zoo.datasets.records import Sequences
 from zoo.dynamics.dmp import discrete_basis
+from zoo.dynamics.population import Shares, estimate
 
 FRAMES, CHANNELS, KERNELS, MOVEMENTS, SETS = 24, 6, 5, 4, 24
 
@@ -41,6 +42,31 @@ def test_the_tails_of_few_movements_are_those_of_a_t() -> None:
     data = demonstrations(0)
     settings = {"kernels": KERNELS, "shrinkage": 0.5, "information": 1.0}
     scales = zoo.fit(zoo.create("promp", data, **settings), data).model.scales.numpy()
+    for level in (0.9, 0.95):
+        far = stats.t.ppf(level, MOVEMENTS - 1)
+        assert stats.norm.cdf(far / scales).mean() == pytest.approx(level, abs=0.01)
+
+
+@pytest.mark.parametrize("shares", [Shares(0.05, 0.1), Shares(0.6, 0.5)])
+def test_parameters_of_few_movements_are_as_wide_as_a_new_one_is_far(shares: Shares) -> None:
+    """The same of dmp's population: its total variance over movements, whatever is shared."""
+    generator, sets = torch.Generator().manual_seed(0), 200
+    flat = torch.zeros(CHANNELS, KERNELS, KERNELS, dtype=torch.float64)
+    sizes = []
+    for _ in range(sets):
+        shape = (MOVEMENTS, CHANNELS, KERNELS)
+        θ = torch.randn(shape, generator=generator, dtype=torch.float64)
+        found = estimate(θ, flat, shares, torch.zeros(KERNELS, dtype=torch.float64))
+        parts = (found.factors, found.private)
+        sizes.append(sum(float(part.square().sum(-1).mean()) for part in parts))
+    error = np.sqrt(2 / (MOVEMENTS - 1) / (sets * KERNELS * CHANNELS))
+    assert np.mean(sizes) == pytest.approx(1 + 1 / MOVEMENTS, abs=5 * error)
+
+
+def test_the_tails_of_few_primitives_are_those_of_a_t() -> None:
+    """dmp's mixture of scales against scipy's t of n − 1 degrees of freedom."""
+    data = demonstrations(0)
+    scales = zoo.fit(zoo.create("dmp", data, kernels=KERNELS), data).model.scales.numpy()
     for level in (0.9, 0.95):
         far = stats.t.ppf(level, MOVEMENTS - 1)
         assert stats.norm.cdf(far / scales).mean() == pytest.approx(level, abs=0.01)
