@@ -68,7 +68,7 @@ class MovementLaw(TorchDistribution):
             x[index] = mean + σ * (path + white)
         return x
 
-    def log_prob(self, value: Float[Tensor, "*batch time channel"]) -> Float[Tensor, "*batch"]:
+    def log_prob(self, value: Float[Tensor, "*movement time channel"]) -> Float[Tensor, "*batch"]:
         """Log density of the entries observed."""
         shape = torch.broadcast_shapes(value.shape[:-2], self.batch_shape)
         law, x = self.expand(shape), value.expand(*shape, *self.event_shape)

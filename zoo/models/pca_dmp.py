@@ -91,7 +91,7 @@ class PcaDmp(nn.Module):
             replace(data, values=z, mask=mask, channels=latent.channels, units=latent.units)
         )
 
-    def forward(self, batch: Batch) -> Float[Tensor, "sequence frame channel"]:
+    def forward(self, batch: Batch) -> Float[Tensor, "*sample sequence frame channel"]:
         """The generative program of the whole movements of ``batch``."""
         z, mask = self._components(batch.movements, batch.movement_mask)
         latent = replace(batch, movements=z, movement_mask=mask)
