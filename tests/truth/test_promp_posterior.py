@@ -14,6 +14,7 @@ from scipy.special import logsumexp
 from zoo.datasets.records import Sequences
 from zoo.dynamics import cross_fitting
 from zoo.dynamics.cross_fitting import choose
+from zoo.dynamics.preparation import Preparation
 from zoo.dynamics.rollout import Timing
 from zoo.dynamics.scales import student_scales
 from zoo.guides.exact import Config as GuideConfig
@@ -202,13 +203,13 @@ def test_nothing_of_a_movement_left_out_is_used_before_it_is_judged(
 ):
     rng = np.random.default_rng(1)
     data = curves(6, rng)
-    model = ProMP(data.layout, Config(kernels=5, synergies=1))
+    preparation = Preparation("discrete", 5, 1, None)
     movements = [(x, seen) for x, seen in zip(data.values, data.mask, strict=True)]
     asked, left = [], []
 
     def prepare(rows):
         asked.append(tuple(rows))
-        return model._prepared(movements, 30.0, rows)
+        return preparation.of(movements, 30.0, rows)
 
     def judged(prepared, values, seen):
         left.append(next(i for i, (x, _) in enumerate(movements) if x is values))
@@ -220,9 +221,9 @@ def test_nothing_of_a_movement_left_out_is_used_before_it_is_judged(
     choose(prepare, movements, group, None, None)
     assert sorted(asked) == [(0, 1, 2, 3), (0, 1, 4, 5), (2, 3, 4, 5)]
     assert left == [0, 1, 2, 3, 4, 5]
-    first = model._prepared(movements, 30.0, [0, 1, 2])
+    first = preparation.of(movements, 30.0, [0, 1, 2])
     movements[3:] = [(0 * x, seen) for x, seen in movements[3:]]
-    again = model._prepared(movements, 30.0, [0, 1, 2])
+    again = preparation.of(movements, 30.0, [0, 1, 2])
     assert torch.equal(first.single.target, again.single.target)
     assert torch.equal(first.single.variance, again.single.variance)
     assert torch.equal(first.synergies, again.synergies)

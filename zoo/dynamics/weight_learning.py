@@ -176,7 +176,7 @@ def similarity(kernels: int, *, circular: bool) -> Float[Tensor, "kernel kernel"
 
 
 def learn(
-    single: Single, views: Sequence[View], share: float, *, iterations: int, tolerance: float
+    single: Single, views: Sequence[View], share: float, iterations: int, tolerance: float
 ) -> Learned:
     """p(w) and σ² of several movements, whose own weights are known.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
@@ -16,17 +15,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.dynamics.alignment import align, durations, extremes
+from zoo.dynamics.alignment import extremes
 from zoo.dynamics.components import Components, Paths, ramp
 from zoo.dynamics.cross_fitting import Choice, Prepared, choose, inflation
-from zoo.dynamics.dmp import discrete_basis, rhythmic_basis
 from zoo.dynamics.hypotheses import Hypotheses, Posteriors
+from zoo.dynamics.preparation import Preparation
 from zoo.dynamics.rollout import Timing
 from zoo.dynamics.scales import student_scales
-from zoo.dynamics.sums import Movements
-from zoo.dynamics.synergies import synergies_of
-from zoo.dynamics.timing import FINE, expected, period_of, phases
-from zoo.dynamics.weight_learning import Noise, Single, learn, similarity, views_of
+from zoo.dynamics.weight_learning import Noise, learn
 from zoo.dynamics.weights import Basis, Weights, superposed
 from zoo.models.baseline import check_fitted, movement_groups, movements_of, seen_entries
 from zoo.prediction import Predictive
@@ -35,7 +31,6 @@ from zoo.types import Batch, Layout, Posterior, Sites
 __all__ = ["Config", "ProMP"]
 
 COMPONENTS = 16
-TEMPOS, PHASES = 9, 32
 SMOOTH = 1.0
 SCALES = {"discrete": 16, "rhythmic": 4}
 
@@ -138,9 +133,8 @@ class ProMP(nn.Module):
         super().__init__()
         self.phased = config.kind == "discrete"
         self.layout, self.config = layout, config
-        moments = ("mean", "root", "noise", "synergies", "offset")
-        learned = ("shrinkage", "information", "scales", "units", "offsets", "reached")
-        for name in (*moments, *learned):
+        learned = "shrinkage information scales units offsets reached"
+        for name in ("mean", "root", "noise", "synergies", "offset", *learned.split()):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
 
     @property
@@ -148,6 +142,11 @@ class ProMP(nn.Module):
         """p(w) of a new movement."""
         check_fitted("promp", self.mean)
         return Weights(self.mean, self.root)
+
+    @property
+    def _preparation(self) -> Preparation:
+        c = self.config
+        return Preparation(c.kind, c.kernels, c.synergies, c.period)
 
     def condition(self, data: Sequences | Pairs) -> None:
         """Learn p(w), the noise, and the durations or the period of the movements."""
@@ -157,7 +156,7 @@ class ProMP(nn.Module):
         rows = zip(movements.values, movements.mask, movements.lengths.tolist(), strict=True)
         inside = [(x[:n], seen[:n]) for x, seen, n in rows]
         self.reached = extremes(movements.values, movements.mask)
-        prepare = partial(self._prepared, inside, movements.rate)
+        prepare = partial(self._preparation.of, inside, movements.rate)
         group, c = movement_groups(movements), self.config
         chosen = choose(prepare, inside, group, c.shrinkage, c.information)
         self._keep(prepare(range(len(inside))), chosen, len(group.unique()))
@@ -195,15 +194,14 @@ class ProMP(nn.Module):
         """Paths of the weights that the movements have, at their likeliest timing."""
         check_fitted("promp", self.mean)
         given = self._given(self._whole(batch.values.shape[1]), whole=True)
-        parts = given.filled(batch.values - self.offset, seen_entries(batch), 1)
-        return self._as_predictive(parts, draws)
+        x = batch.values - self.offset
+        return self._as_predictive(given.filled(x, seen_entries(batch), 1), draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The paths given the entries observed."""
         check_fitted("promp", self.mean)
-        given = self._given(self._whole(batch.values.shape[1]))
-        parts = given.filled(batch.values - self.offset, seen_entries(batch), COMPONENTS)
-        return self._as_predictive(parts, draws)
+        given, x = self._given(self._whole(batch.values.shape[1])), batch.values - self.offset
+        return self._as_predictive(given.filled(x, seen_entries(batch), COMPONENTS), draws)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -254,39 +252,11 @@ class ProMP(nn.Module):
 
     def basis(self, frames: int, timing: Timing) -> Basis:
         """φ and S of ``frames`` frames."""
-        return _basis(self.config, self.synergies, frames, timing)
-
-    def _prepared(self, movements: Movements, rate: float | None, rows: Sequence[int]) -> Prepared:
-        """Some of the movements, with all that is learned before Σ."""
-        some, rhythmic = [movements[i] for i in rows], self.config.kind == "rhythmic"
-        values, mask = (torch.cat([m[j] for m in some])[None] for j in (0, 1))
-        synergies, offset = synergies_of(values, mask, self.config.synergies)
-        basis = partial(_basis, self.config, synergies)
-        inside = [((x - offset) * seen, seen) for x, seen in some]
-        choices = self._choices(inside, rate)
-        timings = align(basis, inside, choices) if rhythmic else choices
-        views = views_of(basis, inside, timings)
-        single = Single.of(views, similarity(self.config.kernels, circular=rhythmic))
-        kept = expected(timings, TEMPOS, PHASES) if rhythmic else durations(timings, COMPONENTS)
-        return Prepared(basis, synergies, offset, views, single, kept)
-
-    def _choices(self, movements: Movements, rate: float | None) -> list[Timing]:
-        """Durations of discrete movements; all tempos and phases of rhythmic ones."""
-        if self.config.kind == "discrete":
-            return [Timing(max(1.0, len(x) - 1.0)) for x, _ in movements]
-        period = self.config.period
-        middle = period_of(movements) if period is None else period * (rate or 1.0)
-        return phases(middle, FINE, PHASES)
+        return self._preparation.basis(self.synergies, frames, timing)
 
     def _keep(self, all_: Prepared, chosen: Choice, groups: int) -> None:
         c = self.config
-        found = learn(
-            all_.single,
-            all_.views,
-            chosen.share,
-            iterations=c.em_iterations,
-            tolerance=c.em_tolerance,
-        )
+        found = learn(all_.single, all_.views, chosen.share, c.em_iterations, c.em_tolerance)
         self.synergies, self.offset = all_.synergies, all_.offset
         self.mean, self.noise = found.weights.mean, found.variance.sqrt()
         self.root = found.weights.root * inflation(groups)
@@ -332,8 +302,7 @@ class ProMP(nn.Module):
 
     def _timings(self, frames: int) -> list[Timing]:
         """Possible timings of a movement whose first ``frames`` frames are known."""
-        pairs = zip(self.units.tolist(), self.offsets.tolist(), strict=True)
-        timings = [Timing(unit, offset) for unit, offset in pairs]
+        timings = [Timing(*t) for t in torch.stack([self.units, self.offsets], 1).tolist()]
         going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
         return going or timings[-1:]
 
@@ -345,12 +314,3 @@ class ProMP(nn.Module):
             epistemic=parts.variance.sqrt(),
             draws=paths.map(lambda y: self.offset + y, paths.shape),
         )
-
-
-def _basis(config: Config, synergies: Tensor, frames: int, timing: Timing) -> Basis:
-    time, kernels = torch.arange(frames, dtype=synergies.dtype), config.kernels
-    if config.kind == "discrete":
-        φ = discrete_basis(time, kernels=kernels, duration=timing.unit)
-    else:
-        φ = rhythmic_basis(time, kernels=kernels, period=timing.unit, offset=timing.offset)
-    return Basis(φ, synergies)
