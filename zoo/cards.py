@@ -46,6 +46,7 @@ class Card:
             "data": self.entry.data,
             "dataset": self.entry.dataset,
             "inference": type(self.entry.inference).__name__,
+            "guide": self.entry.posterior,
             "text": self.text,
             "settings": {
                 k: {"part": p, "type": _type(t), "default": d}
@@ -72,7 +73,7 @@ class Card:
         yield Text(
             f"thesis {self.entry.thesis} · {self.entry.data} · can "
             f"{', '.join(self.entry.capabilities)} · {type(self.entry.inference).__name__} · "
-            f"default data {self.entry.dataset}\n",
+            f"guide: {self.entry.posterior} · default data {self.entry.dataset}\n",
             style="dim",
         )
         yield from _shown(self.text)

@@ -35,7 +35,7 @@ def models_table(entries: Iterable[Entry]) -> Table:
     for entry in entries:
         table.add_row(
             f"[bold]{entry.name}[/]",
-            f"{entry.summary} [dim]({entry.thesis}, {type(entry.inference).__name__})[/]",
+            f"{entry.summary} [dim]({entry.thesis}; guide: {entry.posterior})[/]",
             " ".join(entry.capabilities),
         )
     return table
@@ -43,10 +43,11 @@ def models_table(entries: Iterable[Entry]) -> Table:
 
 def models_markdown(entries: Iterable[Entry]) -> str:
     """Entries as a Markdown table, for the README."""
-    lines = ["| model | what it is | thesis | inference | can |", "|---|---|---|---|---|"]
+    titles = ("model", "what it is", "thesis", "guide", "inference", "can")
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     lines += [
-        f"| `{e.name}` | {e.summary} | {e.thesis} | {type(e.inference).__name__} | "
-        f"{', '.join(e.capabilities)} |"
+        f"| `{e.name}` | {e.summary} | {e.thesis} | {e.posterior} | "
+        f"{type(e.inference).__name__} | {', '.join(e.capabilities)} |"
         for e in entries
     ]
     return "\n".join(lines)

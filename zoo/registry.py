@@ -6,6 +6,7 @@ import ast
 import difflib
 import fnmatch
 import importlib
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -40,6 +41,14 @@ class Entry:
     dataset: str
     scaling: Scaling = "standard"
     config: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def posterior(self) -> str:
+        """The guide in words, such as ``exact posterior``, or ``none``."""
+        if self.guide is None:
+            return "none"
+        _, _, name = self.guide.partition(":")
+        return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()
 
     @property
     def capabilities(self) -> tuple[str, ...]:

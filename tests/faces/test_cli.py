@@ -150,7 +150,7 @@ def test_a_forecast_may_go_beyond_what_is_known(
     assert main([*words, "--figure", str(tmp_path / "bands.png")]) == 0
     assert {r["frame"] for r in json.loads(capsys.readouterr().out)} == set(range(70, 80))
     assert main(["forecast", str(run_folder), "--seen", "0"]) == 2
-    assert "sees 1 to 76 frames" in capsys.readouterr().err
+    assert "seen must be at least 1; got 0" in capsys.readouterr().err
 
 
 def test_a_folder_is_not_overwritten_by_accident(
