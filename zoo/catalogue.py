@@ -64,7 +64,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="promp",
-            summary="Probabilistic movement primitives: joint Gaussian of all weights, exact",
+            summary="Probabilistic movement primitives: one t of all weights, of point estimates",
             thesis="rival, named in §6.1",
             model="zoo.models.promp:ProMP",
             guide="zoo.guides.exact:ExactPosterior",
