@@ -69,3 +69,14 @@ def test_cycles_of_unknown_timing_are_foretold_with_the_right_bands() -> None:
     drawn = prior.condition(observed(truth), torch.arange(TIME) < SEEN).sample(DRAWS)
     rank = (drawn < truth).sum(0) + torch.rand(truth.shape, dtype=torch.float64)
     check_uniform(one_of_each(rank / (DRAWS + 1)))
+
+
+def test_kernels_and_components_together_are_as_wide_as_the_paths_known() -> None:
+    """West's shrinkage: (1 − h²) S of the means and h² S of the kernels are S, whatever h."""
+    paths = white(5, TIME, LATENT, seed=1).cumsum(1)
+    still, spread = torch.zeros_like(paths), torch.zeros(LATENT, TIME, TIME).double()
+    shape = {"bandwidth": 0.6, "shrinkage": 0.0, "process": 0.0}
+    prior = PathPrior(paths, spread, still, OBSERVATION, **shape)
+    covariances = [v.flatten(1).mT.cov() for v in (prior.means, paths)]
+    both = covariances[0] + prior.covariance.reshape(TIME * LATENT, -1)
+    torch.testing.assert_close(both, covariances[1])
