@@ -15,6 +15,7 @@ __all__ = [
     "ridge_regression",
     "stationary_variance",
     "target_force",
+    "target_known",
     "trajectory_matrix",
 ]
 
@@ -41,6 +42,16 @@ def target_force(
     acceleration = velocity.diff(dim=-2) / system.dt
     before = position[..., :-1, :], velocity[..., :-1, :]
     return velocity[..., 0, :], _force(*before, acceleration, goal, system)
+
+
+def target_known(seen: Bool[Tensor, "*batch time"]) -> Bool[Tensor, "*batch time_minus_1"]:
+    """Steps whose target force needs no frame that is missing.
+
+    >>> target_known(torch.tensor([True, True, False, True, True, True])).tolist()
+    [True, False, False, False, True]
+    """
+    before = torch.cat([seen[..., :1], seen[..., :-2]], dim=-1)
+    return before & seen[..., :-1] & seen[..., 1:]
 
 
 def central_target_force(

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from zoo.dynamics.dmp import Response, Transformation, discrete_basis
 from zoo.dynamics.imitation import target_force, trajectory_matrix
+from zoo.dynamics.paths import PathPrior
 
 __all__ = ["GOAL", "Imitator"]
 
 GOAL, WEIGHTS = 2, 3
 SCALES = (1.0, 10.0, 1.0, 3.0)
-RIDGE = 1e-4
+RIDGE, FLOOR = 1e-4, 1e-3
 ALPHA, ALPHA_FRAME = 25.0, 0.4
 
 
@@ -124,6 +127,29 @@ class Imitator:
         moved = theta.clone()
         moved[..., GOAL, :] += (goal - end @ theta) / end[GOAL]
         return moved
+
+    def prior(
+        self,
+        theta: Float[Tensor, "movement parameter latent"],
+        residuals: Float[Tensor, "movement time latent"],
+        length: int,
+        shape: Sequence[float],
+    ) -> PathPrior:
+        """The mixture over paths of ``length`` frames around the roll-outs of known movements.
+
+        ``residuals`` are what the roll-outs leave of whole movements; ``shape`` is h, λ and ν where
+        these are known.
+        """
+        one = len(theta) == 1
+        size = theta.square().mean((0, 1)).expand_as(theta[0]) if one else theta.var(0)
+        return PathPrior.of_responses(
+            self.design(length).to(theta.device),
+            theta,
+            size,
+            pad(residuals, (0, 0, 0, length - self.frames)),
+            FLOOR**2 * torch.eye(theta.shape[-1], dtype=theta.dtype, device=theta.device),
+            shape,
+        )
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,9 @@ from typing import Any, Self
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
+from zoo.dynamics.components import alike
 from zoo.dynamics.gaussian_paths import block_diagonal, cholesky, stationary
 
 __all__ = ["Conditioned", "PathPrior", "Readout"]
@@ -108,6 +110,20 @@ class PathPrior:
             prior=full,
             known=half,
         )
+
+    def completed(
+        self,
+        seen: Float[Tensor, "sequence seen latent"],
+        where: Bool[Tensor, "sequence seen"],
+        draws: int,
+    ) -> Float[Tensor, "sample sequence time latent"]:
+        """Joint draws of whole paths given their first frames, ``where`` these were observed."""
+        beyond = self.paths.shape[1] - seen.shape[1]
+        paths = seen.new_empty(draws, len(seen), *self.paths.shape[1:])
+        values = pad(seen.double(), (0, 0, 0, beyond))
+        for rows, frames in alike(pad(where, (0, beyond))):
+            paths[:, rows] = self.condition(values[rows], frames).sample(draws).to(seen)
+        return paths
 
     def tuned(
         self, seen: Sequence[int], readout: Readout, without: Callable[[int], PathPrior]

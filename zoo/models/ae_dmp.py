@@ -10,14 +10,14 @@ import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from zoo.dynamics.alignment import extremes
-from zoo.dynamics.components import alike, ramp
+from zoo.dynamics.components import ramp
+from zoo.dynamics.imitation import target_known
 from zoo.dynamics.imitator import Imitator
 from zoo.dynamics.paths import PathPrior, Readout
 from zoo.errors import NotFittedError
-from zoo.models.latent_dmp import check_end, check_whole, common_length
+from zoo.models.latent_dmp import check_end, check_whole, common_length, need
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp, widths
 from zoo.prediction import Predictive
@@ -26,7 +26,6 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["AeDmp", "Config"]
 
 PRIORS = {"normal": dist.Normal, "laplace": dist.Laplace}
-FLOOR = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,9 +148,9 @@ class AeDmp(nn.Module):
             if self.integrated:
                 f, f_target = self.imitator.forces(y, θ)
                 force = dist.Normal(f, self.σ / self.config.penalty**0.5)
-                pyro.sample(
-                    "f", force.mask(_steps(batch.mask)).to_event(2), obs=batch.given(f_target)
-                )
+                if batch.mask is not None:
+                    force = force.mask(target_known(batch.mask.any(-1))[..., None])
+                pyro.sample("f", force.to_event(2), obs=batch.given(f_target))
 
     def _weight_prior(self, scale: float) -> Float[Tensor, ""]:
         """log p of the decoder's weights, N(0, ``scale``²) each, up to a constant."""
@@ -214,7 +213,7 @@ class AeDmp(nn.Module):
         """Goal changes (§5.3.6, in latent space), other durations, and switching (89)."""
         θ, length = self._imitated(batch, posterior), round((self.frames - 1) * duration) + 1
         if goal is not None:
-            θ = self.imitator.aimed(θ, _need(posterior).encode(goal).mean)
+            θ = self.imitator.aimed(θ, need(posterior).encode(goal).mean)
         if onto is None:
             return self._decoded((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
         η = ramp(length, start, steps)
@@ -259,15 +258,7 @@ class AeDmp(nn.Module):
             raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
         kept = slice(None) if rows is None else rows
         θ, residuals = self.prior_movements[kept].double(), self.prior_residuals[kept].double()
-        size = θ.var(0) if len(θ) > 1 else θ.square().mean((0, 1)).expand_as(θ[0])
-        return PathPrior.of_responses(
-            self.imitator.design(length).to(θ.device),
-            θ,
-            size,
-            pad(residuals, (0, 0, 0, length - self.frames)),
-            FLOOR**2 * torch.eye(self.latent_dim, dtype=torch.float64, device=θ.device),
-            self.prior_shape.tolist(),
-        )
+        return self.imitator.prior(θ, residuals, length, self.prior_shape.tolist())
 
     def _completed(
         self,
@@ -277,20 +268,14 @@ class AeDmp(nn.Module):
         draws: int,
     ) -> Float[Tensor, "sample sequence frame latent"]:
         """Draws of paths of ``length`` frames given the latent frames seen."""
-        beyond = length - y.shape[1]
-        check_end(self.label, self.frames, y.shape[1], beyond)
-        prior = self._prior(length)
-        paths = y.new_empty(draws, len(y), length, self.latent_dim)
-        values, where = pad(y.double(), (0, 0, 0, beyond)), pad(seen, (0, beyond))
-        for rows, frames in alike(where):
-            paths[:, rows] = prior.condition(values[rows], frames).sample(draws).to(y)
-        return paths
+        check_end(self.label, self.frames, y.shape[1], length - y.shape[1])
+        return self._prior(length).completed(y, seen, draws)
 
     def _encoded(
         self, batch: Batch, posterior: Posterior | None
     ) -> tuple[Float[Tensor, "sequence time latent"], Bool[Tensor, "sequence time"]]:
         """Latent frames, missing joints filled by passing them k times; frames seen at all."""
-        guide, x = _need(posterior), batch.values
+        guide, x = need(posterior), batch.values
         if batch.mask is None:
             return guide.encode(x).mean, torch.ones_like(x[..., 0], dtype=torch.bool)
         x = torch.where(batch.mask, x, 0.0)
@@ -300,7 +285,7 @@ class AeDmp(nn.Module):
 
     def _imitated(self, batch: Batch, posterior: Posterior | None) -> Tensor:
         self._whole(batch)
-        return _need(posterior).draw(batch, 1)["theta"][0]
+        return need(posterior).draw(batch, 1)["theta"][0]
 
     def _whole(self, batch: Batch) -> Tensor:
         check_whole(self.label, self.frames, batch.values.shape[1])
@@ -312,18 +297,3 @@ class AeDmp(nn.Module):
 
 def _all(mask: Tensor | None) -> Tensor | bool:
     return True if mask is None else mask
-
-
-def _steps(mask: Tensor | None) -> Tensor | bool:
-    """Steps whose target force needs no frame that is missing altogether."""
-    if mask is None:
-        return True
-    seen = mask.any(-1)
-    before = torch.cat([seen[:, :1], seen[:, :-2]], dim=1)
-    return (before & seen[:, :-1] & seen[:, 1:])[..., None]
-
-
-def _need(posterior: Posterior | None) -> Posterior:
-    if posterior is None:
-        raise TypeError("this model predicts through its guide; got no posterior")
-    return posterior

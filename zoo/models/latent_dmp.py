@@ -22,9 +22,9 @@ from zoo.dynamics.plan import Plan
 from zoo.errors import MovementLengthError
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp
-from zoo.types import Batch, Layout
+from zoo.types import Batch, Layout, Posterior
 
-__all__ = ["Config", "LatentDmp", "check_end", "check_whole", "common_length"]
+__all__ = ["Config", "LatentDmp", "check_end", "check_whole", "common_length", "need"]
 
 ALPHA, ALPHA_FRAME = 25.0, 0.4
 BEYOND = 0.1
@@ -260,6 +260,13 @@ def common_length(label: str, layout: Layout) -> int:
             "bring them to n frames by data.resampled(n), or cut them by data.windows(n)"
         )
     return layout.frames
+
+
+def need(posterior: Posterior | None) -> Posterior:
+    """The posterior; a model that predicts through its guide refuses to do without."""
+    if posterior is None:
+        raise TypeError("this model predicts through its guide; got no posterior")
+    return posterior
 
 
 def check_whole(label: str, frames: int, given: int) -> None:
