@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from zoo.dynamics.plan import Plan
+from zoo.dynamics.plan import Latents, Plan
 from zoo.models.latent_dmp import Config
-from zoo.models.vae_dmp import Latents, VaeDmp
+from zoo.models.vae_dmp import VaeDmp
 from zoo.models.vae_dmp_rhythmic import Config as RhythmicConfig
 from zoo.models.vae_dmp_rhythmic import RhythmicVaeDmp
 from zoo.types import Layout

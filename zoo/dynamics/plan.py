@@ -8,7 +8,7 @@ from typing import Self
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Plan"]
+__all__ = ["Latents", "Plan"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,3 +39,14 @@ class Plan:
     def of(cls, drawn: dict[str, Tensor]) -> Self:
         """The plan among the draws of all sites."""
         return cls(**{f.name: drawn[f.name] for f in fields(cls) if f.name in drawn})
+
+
+@dataclass(frozen=True)
+class Latents:
+    """What belongs to movements, in the space of z*; w is scaled by goal − start, if at all."""
+
+    plan: Plan
+    w: Float[Tensor, "sample sequence kernel latent"]
+    goal: Float[Tensor, "sample sequence latent"]
+    position: Float[Tensor, "sample sequence latent"]
+    velocity: Float[Tensor, "sample sequence latent"]

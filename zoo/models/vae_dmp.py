@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from jaxtyping import Float
+from torch import Tensor
 
-from zoo.dynamics.alignment import extremes
 from zoo.dynamics.components import ramp
 from zoo.dynamics.dmp import Response
-from zoo.dynamics.paths import Conditioned, PathPrior, Readout
-from zoo.dynamics.plan import Plan
-from zoo.errors import NotFittedError
+from zoo.dynamics.plan import Latents, Plan
 from zoo.inference.laplace import laplace
-from zoo.models.latent_dmp import Config, LatentDmp, check_end, check_whole
+from zoo.models.latent_dmp import Config, check_whole, need
+from zoo.models.latent_path_prior import PRIOR_DRAWS, LatentPathPrior, observed
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior
+from zoo.types import Batch, Posterior
 
-__all__ = ["Config", "Latents", "VaeDmp", "observed"]
+__all__ = ["Config", "VaeDmp"]
 
-_LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape", "reached")
-PRIOR_DRAWS = 32
-RESTARTS, KEPT = 4, 64
-UNSEEN = 1e6
 GOAL_SLACK = 1e-2
 
 
-class VaeDmp(LatentDmp):
+class VaeDmp(LatentPathPrior):
     r"""Movements as latent DMPs with process noise, decoded frame by frame (thesis §6.2).
 
     With s = (z*, ż), β = α/4 and dt = 1/(n − 1)::
@@ -57,18 +51,6 @@ class VaeDmp(LatentDmp):
     N. Chen, M. Karl, P. van der Smagt, *Dynamic movement primitives in latent space of
     time-dependent variational autoencoders*, Humanoids 2016.
     """
-
-    prior_movements: Tensor
-    prior_residuals: Tensor
-    prior_observation: Tensor
-    prior_shape: Tensor
-    reached: Tensor
-
-    def __init__(self, layout: Layout, config: Config) -> None:
-        """A model of movements of ``layout.frames`` frames, all of one length."""
-        super().__init__(layout, config)
-        for name in _LEARNED:
-            self.register_buffer(name, torch.empty(0))
 
     def forward(self, batch: Batch) -> None:
         """The Pyro program: both sub-sequence lengths, (80) and (81), observe the window (82)."""
@@ -115,12 +97,12 @@ class VaeDmp(LatentDmp):
     ) -> Predictive:
         """Joint draws of the future, given the encoded frames seen; phase 0 is the first frame."""
         seen = batch.values.shape[1]
-        paths = self._conditioned(batch, _need(posterior), seen + horizon).sample(draws)
+        paths = self._conditioned(batch, need(posterior), seen + horizon).sample(draws)
         return self._decoded(paths[:, :, seen:])
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Joint draws of whole movements given the entries seen."""
-        paths = self._conditioned(batch, _need(posterior), batch.values.shape[1]).sample(draws)
+        paths = self._conditioned(batch, need(posterior), batch.values.shape[1]).sample(draws)
         return self._decoded(paths)
 
     def generate(
@@ -136,7 +118,7 @@ class VaeDmp(LatentDmp):
         draws: int,
     ) -> Predictive:
         """Goal changes (§6.2.5), other durations and switching (89), with noise from its prior."""
-        guide = _need(posterior)
+        guide = need(posterior)
         here = self._latents(guide.draw(batch, draws))
         if goal is not None:
             here = self._aimed(here, self._goal(goal, guide, draws))
@@ -154,26 +136,6 @@ class VaeDmp(LatentDmp):
         force = system.stiffness * (pull + noise)
         return self._decoded(response.states(position, velocity / duration, rest, force)[0])
 
-    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
-        """Keep the latents of the training movements, and what the encoder sees beside them.
-
-        The residuals are what the noise ε must add for the paths to pass through the encoded
-        frames; how far new movements may be from those known is found by leaving each out.
-        """
-        found = self._latents(posterior.draw(batch, PRIOR_DRAWS))
-        parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
-        self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
-        self.reached = extremes(batch.values, observed(batch))
-        frames, seen = self._observe(batch, posterior), self._frames_seen(batch)
-        self.prior_residuals = torch.zeros_like(frames)
-        self.prior_shape = frames.new_empty(0)
-        rolled = self._prior(self.frames).paths.to(frames)
-        self.prior_residuals = ((frames - rolled) * seen[..., None]).detach()
-        tuned = self._prior(self.frames).tuned(
-            (self.frames // 7, self.frames // 2), self._readout(frames), self.prior_without
-        )
-        self.prior_shape = frames.new_tensor(tuned.shape)
-
     def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
         """σ of movements that no network was trained on, never below what training found.
 
@@ -186,40 +148,6 @@ class VaeDmp(LatentDmp):
         mean = (error * mask).sum((0, 1)) / mask.sum((0, 1)).clamp(min=1)
         std = torch.maximum(mean.sqrt(), self.output_std)
         self.output_root.copy_((std - self.config.output_floor).sqrt())
-
-    def prior_without(self, row: int) -> PathPrior:
-        """The mixture over latent paths of all training movements but one."""
-        return self._prior(self.frames, torch.arange(len(self.prior_movements)) != row)
-
-    def _observe(self, batch: Batch, posterior: Posterior) -> Float[Tensor, "sequence time latent"]:
-        """Encoded frames; how uncertain they are is kept."""
-        q = posterior.encode(batch.values, batch.mask)
-        frames, seen = self.embed(q.mean), self._frames_seen(batch)
-        noise = (self.embed(q.sample((PRIOR_DRAWS,))) - frames) * seen[..., None]
-        share = PRIOR_DRAWS * seen.sum() / len(frames)
-        self.prior_observation = (torch.einsum("smti,smtj->mij", noise, noise) / share).detach()
-        return frames
-
-    def _readout(self, frames: Float[Tensor, "sequence time latent"]) -> Readout:
-        jacobian = torch.func.vmap(torch.func.jacfwd(self.decoder))(frames.flatten(0, 1))
-        shape = (*frames.shape[:2], *jacobian.shape[1:])
-        return Readout(jacobian.detach().double().view(shape), self.output_std.detach().double())
-
-    def _frames_seen(self, batch: Batch) -> Bool[Tensor, "sequence time"]:
-        if batch.mask is None:
-            return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=self.basis.device)
-        return batch.mask.all(-1)
-
-    def _latents(self, drawn: dict[str, Tensor]) -> Latents:
-        start = self.embed(drawn["start"]) if self.goal_scaling else None
-        goal = self.embed(drawn["goal"])
-        return Latents(
-            w=self.scaled(drawn["w"], goal, start),
-            plan=Plan.of(drawn),
-            goal=goal,
-            position=self.embed(drawn["z"][:, :, 0]),
-            velocity=self.config.velocity_scale * drawn["velocity"],
-        )
 
     def _pull(self, found: Latents, duration: float) -> Float[Tensor, "sample sequence step d"]:
         """z^goal + σ_w Ψ w at every step: the forces in units of αβ."""
@@ -262,112 +190,8 @@ class VaeDmp(LatentDmp):
 
     def _posterior_paths(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
         check_whole(self.label, self.frames, batch.values.shape[1])
-        return self._paths(_need(posterior).draw(batch, draws), batch, draws)
+        return self._paths(need(posterior).draw(batch, draws), batch, draws)
 
     def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
         location = self.decoder(paths.to(self.output_root))
         return Predictive(location=location, noise=self.output_std, joint=True)
-
-    def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
-        """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
-        if not self.prior_movements.numel():
-            raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
-        movements, residuals, observation = self._known(rows)
-        u, missing = movements.double(), length - self.frames
-        response = Response.of(self.system, length, torch.float64, u.device)
-        force = self.system.stiffness * torch.cat(
-            [self.config.w_scale * self.kernels_at(length - 1), torch.ones(length - 1, 1)], dim=1
-        )
-        start = torch.zeros(2, self.kernels + 3, dtype=torch.float64)
-        start[0, -2] = start[1, -1] = 1.0
-        φ = response.product(start, nn.functional.pad(force, (0, 2)))[0]
-        return PathPrior.of_responses(
-            φ,
-            u,
-            _variances(u),
-            nn.functional.pad(residuals.double(), (0, 0, 0, missing)),
-            observation.double().mean(0),
-            self.prior_shape.tolist(),
-        )
-
-    def _known(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Latents, residuals and observation noise of all training movements or of some."""
-        kept = slice(None) if rows is None else rows
-        return (
-            self.prior_movements[kept],
-            self.prior_residuals[kept],
-            self.prior_observation[kept],
-        )
-
-    def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
-        """p(z*_{1:length} | frames seen)."""
-        seen = batch.values.shape[1]
-        if self.phased:
-            check_end(self.label, self.frames, seen, length - seen)
-        prior = self._prior(length)
-        where = torch.arange(length) < seen
-        y = self.embed(posterior.encode(batch.values, batch.mask).mean)
-        extra = None
-        if batch.mask is not None and _is_one_section(batch.mask):
-            where[:seen] = batch.mask[0, :, 0]
-        elif batch.mask is not None:
-            y, extra = self._encoded(batch.values, batch.mask, y, posterior)
-            extra = nn.functional.pad(extra.double(), (0, 0, 0, 0, 0, length - seen))
-        return prior.condition(
-            nn.functional.pad(y.double(), (0, 0, 0, length - seen)), where, extra
-        )
-
-    def _encoded(
-        self, values: Tensor, mask: Tensor, y: Tensor, posterior: Posterior
-    ) -> tuple[Float[Tensor, "sequence time d"], Float[Tensor, "sequence time d d"]]:
-        """Latent frames and how uncertain missing entries make them, by the decoder alone."""
-        extra = torch.diag_embed(UNSEEN * (~mask.any(-1, keepdim=True)).to(y).expand_as(y))
-        part = mask.any(-1) & ~mask.all(-1)
-        if not part.any():
-            return y, extra
-        known = laplace(
-            lambda z: self.decoder(self.embed(z)),
-            posterior.encode(values, mask).mean[part],
-            values[part],
-            torch.where(mask[part], self.output_std, torch.inf),
-            restarts=RESTARTS,
-            near=False,
-        )
-        moved = self.embed(known.sample((KEPT,)))
-        apart = moved - moved.mean(0)
-        extra[part] = torch.einsum("sid,sie->ide", apart, apart) / (KEPT - 1)
-        return y.masked_scatter(part[..., None], moved.mean(0)), extra
-
-
-@dataclass(frozen=True)
-class Latents:
-    """What belongs to movements, in the space of z*; w is scaled by goal − start, if at all."""
-
-    plan: Plan
-    w: Float[Tensor, "sample sequence kernel latent"]
-    goal: Float[Tensor, "sample sequence latent"]
-    position: Float[Tensor, "sample sequence latent"]
-    velocity: Float[Tensor, "sample sequence latent"]
-
-
-def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row latent"]:
-    """Variance of every row between movements, one for all kernels; of one movement its size."""
-    apart = u - u.mean(0) if len(u) > 1 else u
-    kernels = apart[:, :-3].square().mean((0, 1)).expand(u.shape[1] - 3, -1)
-    return torch.cat([kernels, apart[:, -3:].square().mean(0)])
-
-
-def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
-    """Whether only whole frames are missing, the same of every movement."""
-    return bool((mask == mask[:1, :, :1]).all())
-
-
-def observed(batch: Batch) -> Bool[Tensor, "window time channel"]:
-    """Which entries were observed."""
-    return torch.ones_like(batch.values, dtype=torch.bool) if batch.mask is None else batch.mask
-
-
-def _need(posterior: Posterior | None) -> Posterior:
-    if posterior is None:
-        raise TypeError("this model predicts through its guide; got no posterior")
-    return posterior

@@ -16,12 +16,13 @@ from zoo.datasets.records import Sequences
 from zoo.dynamics.alignment import extremes
 from zoo.dynamics.cycles import CyclePrior
 from zoo.dynamics.dmp import Response, rhythmic_basis
-from zoo.dynamics.plan import Plan
+from zoo.dynamics.plan import Latents, Plan
 from zoo.dynamics.timing import period_of, tempos
 from zoo.errors import NotFittedError
 from zoo.models import latent_dmp
 from zoo.models.latent_dmp import ALPHA_FRAME
-from zoo.models.vae_dmp import PRIOR_DRAWS, Latents, VaeDmp, observed
+from zoo.models.latent_path_prior import PRIOR_DRAWS, observed
+from zoo.models.vae_dmp import VaeDmp
 from zoo.types import Batch, Layout, Posterior
 
 __all__ = ["Config", "RhythmicVaeDmp"]
