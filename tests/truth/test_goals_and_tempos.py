@@ -45,7 +45,7 @@ def test_the_tempos_of_a_new_movement_are_about_those_found(tempo: float) -> Non
     model = RhythmicVaeDmp(LAYOUT, RhythmicConfig(latent_dim=1, period=PERIOD / 30))
     model.prior_movements = torch.randn(3, model.kernels + 1, 1)
     model.prior_residuals = 0.1 * torch.randn(3, 24, 1)
-    model.prior_observation = torch.eye(1)
+    model.prior_observation = torch.eye(1).expand(3, 1, 1)
     model.prior_timings = torch.tensor([[0.0, tempo], [1.0, tempo], [2.0, tempo]])
     designs = model._prior(400).designs[..., 0].numpy()
     centred = designs - designs.mean(1, keepdims=True)
