@@ -29,12 +29,13 @@ def modules() -> list[str]:
 
 
 def examples(module: ModuleType) -> list[doctest.DocTest]:
-    """Examples of a module and of what is defined there, inside of decorators too."""
+    """Examples of a module and of what is written there, inside of decorators too."""
     things = {id(t): t for t in vars(module).values() if inspect.isclass(t) or inspect.isroutine(t)}
     own = [t for t in things.values() if t.__module__ == module.__name__]
     finder = doctest.DocTestFinder()
     parts = (finder.find(t, module=False, globs=vars(module)) for t in own)  # type: ignore[arg-type]
-    return [example for part in parts for example in part]
+    text = inspect.getsource(module)
+    return [example for part in parts for example in part if example.docstring in text]
 
 
 @pytest.mark.parametrize("name", modules())

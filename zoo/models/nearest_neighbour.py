@@ -146,6 +146,7 @@ class NearestNeighbour(nn.Module):
     @property
     def library(self) -> Library:
         """The training movements."""
+        check_fitted("nearest-neighbour", self.memory)
         everybody = torch.ones_like(self.lengths, dtype=torch.bool)
         return Library(self.memory, self.seen, self.lengths, everybody)
 

@@ -113,7 +113,7 @@ class VAEDynamics(nn.Module):
     def step(
         self,
         z: Float[Tensor, "*batch latent"],
-        action: Float[Tensor, "*batch control"] | None,
+        action: Float[Tensor, "*row control"] | None,
     ) -> Float[Tensor, "*batch latent"]:
         """z̃_{t+1} = [z_t a_t] W + b, (70)."""
         if action is not None:
