@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import pyro.distributions as dist
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from zoo.dynamics.components import alike, resample
+from zoo.dynamics.components import Components, Paths, alike, resample
 from zoo.dynamics.movement_law import Noise
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Primitive, Timing
@@ -106,6 +106,24 @@ class Cases:
                 timing, scale = divmod(i, 1 if count == 1 else len(self.scales))
                 s = one if count == 1 else self.scales[scale]
                 yield group.rows[some], picks[:, some] == i, self.case(group, timing, s, some)
+
+    def mixture(
+        self, values: Tensor, seen: Tensor, count: int, render: Callable[[Case], Paths]
+    ) -> Components:
+        """Paths that ``render`` makes of every case, a mixture of ``count`` of them."""
+        parts = Components.empty(count, values)
+        for rows, which, case in self.chosen(values, seen, count):
+            parts.put(rows, which, render(case))
+        return parts
+
+    def demonstrated(self, values: Tensor, seen: Tensor) -> list[Case]:
+        """The likeliest timing of every movement, with the usual scale, and p(θ | x)."""
+        cases, one = dict[int, Case](), self.scales.new_ones(())
+        for group in self.groups(values, seen):
+            best = self.likeliest(group).tolist()
+            for j, (row, i) in enumerate(zip(group.rows.tolist(), best, strict=True)):
+                cases[row] = self.case(group, i, one, torch.tensor([j]))
+        return [cases[row] for row in range(len(values))]
 
     def case(self, group: Group, timing: int, scale: Tensor, some: Tensor) -> Case:
         """p(θ | x) of some movements of a group."""

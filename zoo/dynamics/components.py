@@ -11,7 +11,7 @@ from torch import Tensor
 
 from zoo.mixtures import Deferred
 
-__all__ = ["Components", "Paths", "alike", "minimum_jerk", "ramp", "resample"]
+__all__ = ["Components", "Draw", "Paths", "alike", "minimum_jerk", "ramp", "resample"]
 
 Draw = Callable[[int], Tensor]
 

@@ -24,6 +24,7 @@ __all__ = [
     "observe",
     "observe_in_turn",
     "seen_entries",
+    "seen_movements",
 ]
 
 
@@ -72,6 +73,13 @@ def seen_entries(batch: Batch) -> Bool[Tensor, "window *time channel"]:
     if batch.mask is not None:
         return batch.mask
     return torch.ones_like(batch.values, dtype=torch.bool)
+
+
+def seen_movements(batch: Batch) -> Bool[Tensor, "sequence frame channel"]:
+    """The mask of the whole movements of a batch, spelled out where these are complete."""
+    if batch.movement_mask is not None:
+        return batch.movement_mask
+    return torch.ones_like(batch.movements, dtype=torch.bool)
 
 
 def observe(batch: Batch, likelihood: dist.TorchDistribution) -> Tensor:
