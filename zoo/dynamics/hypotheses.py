@@ -73,6 +73,16 @@ class Hypotheses:
                 parts.put(view.rows, which, path)
         return parts
 
+    def demonstrated(self, x: Tensor, seen: Tensor) -> list[tuple[Timing, Weights]]:
+        """The likeliest timing of every movement and the posterior of its weights."""
+        found = dict[int, tuple[Timing, Weights]]()
+        for views in self.sights(x, seen):
+            for i, view, scale, _ in self.chosen(views, 1):
+                weights = self.posterior(view, scale)
+                for row, mean in zip(view.rows.tolist(), weights.mean, strict=True):
+                    found[row] = (self.timings[i], Weights(mean[None], weights.root))
+        return [found[row] for row in range(len(x))]
+
 
 class Posteriors:
     """p(timing | x), p(scale | timing, x) and p(w | timing, scale, x) of some movements."""

@@ -24,7 +24,13 @@ from zoo.dynamics.rollout import Timing
 from zoo.dynamics.scales import student_scales
 from zoo.dynamics.weight_learning import Noise, learn
 from zoo.dynamics.weights import Basis, Weights, superposed
-from zoo.models.baseline import check_fitted, movement_groups, movements_of, seen_entries
+from zoo.models.baseline import (
+    check_fitted,
+    movement_groups,
+    movements_of,
+    seen_entries,
+    seen_movements,
+)
 from zoo.prediction import Predictive
 from zoo.types import Batch, Layout, Posterior, Sites
 
@@ -272,21 +278,15 @@ class ProMP(nn.Module):
         return Hypotheses(self.weights, noise, self.basis, timings, self.scales)
 
     def _posteriors(self, batch: Batch) -> Posteriors:
-        mask, x = batch.movement_mask, batch.movements
-        seen = torch.ones_like(x, dtype=torch.bool) if mask is None else mask
-        return Posteriors(self._given(self._whole(x.shape[1])), x - self.offset, seen)
+        given, x = self._given(self._whole(batch.movements.shape[1])), batch.movements - self.offset
+        return Posteriors(given, x, seen_movements(batch))
 
     def _demonstrated(self, batch: Batch, count: int) -> list[tuple[Timing, Weights]]:
         """The likeliest timing of every movement and the posterior of its weights."""
         if len(batch) not in (1, count):
             raise ValueError(f"onto has {len(batch)} movements; 1 or {count} are needed")
         given = self._given(self._whole(batch.values.shape[1]), whole=True)
-        found = dict[int, tuple[Timing, Weights]]()
-        for views in given.sights(batch.values - self.offset, seen_entries(batch)):
-            for i, view, scale, _ in given.chosen(views, 1):
-                weights = given.posterior(view, scale)
-                for row, mean in zip(view.rows.tolist(), weights.mean, strict=True):
-                    found[row] = (given.timings[i], Weights(mean[None], weights.root))
+        found = given.demonstrated(batch.values - self.offset, seen_entries(batch))
         return [found[i if len(batch) == count else 0] for i in range(count)]
 
     def _moved(self, weights: Weights, basis: Basis, goal: Tensor) -> Weights:
