@@ -74,10 +74,10 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="pca-dmp",
-            summary="Principal components, then one movement primitive for each, in two stages",
+            summary="Principal components with a primitive each, exact given point estimates",
             thesis="Table 2",
             model="zoo.models.pca_dmp:PcaDmp",
-            guide=None,
+            guide="zoo.guides.exact:ExactPosterior",
             inference=Exact(),
             data="sequences",
             dataset="robot-arm/reaching",

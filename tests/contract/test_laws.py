@@ -48,7 +48,6 @@ UNCALIBRATED = {
     "nearest-neighbour": "it answers by movements that it knows, aligned; its program is their mix",
     "kernel-ridge": "it answers by regressions for the entries asked, its program by frames alone",
 }
-TWO_STAGES = ("pca-dmp",)  # each in closed form, both together no inference: its card says so
 every = pytest.mark.parametrize("name", NAMES)
 
 
@@ -84,7 +83,7 @@ def test_a_minibatch_stands_for_the_whole_training_set(name: str) -> None:
 
 @every
 def test_every_entry_has_a_guide_or_is_a_baseline(name: str) -> None:
-    assert (CATALOGUE[name].guide is None) == (name in BASELINES or name in TWO_STAGES)
+    assert (CATALOGUE[name].guide is None) == (name in BASELINES)
 
 
 @pytest.mark.parametrize("name", [n for n in CLOSED if CATALOGUE[n].guide is not None])

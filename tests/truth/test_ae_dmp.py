@@ -1,4 +1,4 @@
-"""AE-DMP and PCA-DMP against the same numbers by other roads."""
+"""AE-DMP against the same numbers by other roads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from zoo.guides import point
 from zoo.inference.loader import whole
 from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
-from zoo.models import ae_dmp, dmp, pca, pca_dmp
+from zoo.models import ae_dmp
 from zoo.strategies import Svi
 
 IMITATOR = Imitator(frames=40, kernels=8)
@@ -208,33 +208,3 @@ def test_a_population_is_conditioned_on_each_movement_by_itself() -> None:
         alone = prior.condition(precision[i], linear[i : i + 1])
         torch.testing.assert_close(together.mean[i : i + 1], alone.mean)
         torch.testing.assert_close(together.factors[i], alone.factors)
-
-
-def test_pca_dmp_is_one_after_the_other() -> None:
-    data = movements()
-    both = pca_dmp.PcaDmp(data.layout, pca_dmp.Config(latent_dim=2))
-    both.condition(data)
-    first = pca.PCA(data.layout, pca.Config(latent_dim=2))
-    first.condition(data)
-    z = first.represent(whole(data), None, draws=1).location[0]
-    names = ("z_1", "z_2")
-    latent = replace(data, values=z, mask=torch.ones_like(z).bool(), channels=names, units=("", ""))
-    second = dmp.DMP(latent.layout, dmp.Config())
-    second.condition(latent)
-    path = second.reconstruct(whole(latent), None, draws=1).location[0]
-    expected = path @ first.loading.T + first.mean
-    found = both.reconstruct(whole(data), None, draws=1).location[0]
-    torch.testing.assert_close(found, expected)
-
-
-def test_draws_and_closed_form_of_pca_dmp_agree_where_components_are_independent() -> None:
-    data = movements()
-    model = pca_dmp.PcaDmp(data.layout, pca_dmp.Config(latent_dim=1))
-    model.condition(data)
-    count = 4000
-    torch.manual_seed(0)
-    found = model.forecast(whole(data.first(10)), None, horizon=6, draws=count)
-    assert found.draws is not None and found.epistemic is not None
-    variance = found.epistemic.square().mean(0) + found.location.var(0, correction=0)
-    ratio = found.draws.var(0) / variance
-    assert float((ratio - 1).abs().max()) < 6 * (2 / count) ** 0.5

@@ -17,7 +17,7 @@ from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Primitive, Timing
 from zoo.dynamics.sums import Sight, Sums, sights
 
-__all__ = ["Case", "Cases", "Posteriors"]
+__all__ = ["Case", "Cases", "Group", "Posteriors", "Unknowns"]
 
 Drawn = Mapping[str, Tensor]
 
@@ -34,16 +34,22 @@ class Case:
 
 @dataclass(frozen=True)
 class Group:
-    """Movements with the same entries observed, at every timing."""
+    """Movements with the same entries observed: what they say of θ at every timing."""
 
     rows: Int[Tensor, " some"]
     x: Float[Tensor, "some time channel"]
-    sights: list[Sight]
     sums: list[Sums]
 
 
 @dataclass(frozen=True)
-class Cases:
+class Sighted(Group):
+    """A group with how its entries see movements, at every timing."""
+
+    sights: list[Sight]
+
+
+@dataclass(frozen=True)
+class Unknowns:
     """Equally likely timings and scales s of the deviations from the mean movement.
 
     Every entry counts as ``information`` of an independent one.
@@ -61,14 +67,8 @@ class Cases:
         values: Float[Tensor, "sequence time channel"],
         seen: Bool[Tensor, "sequence time channel"],
     ) -> Iterator[Group]:
-        """What the movements say of θ; the errors of timings of one tempo are the same."""
-        for rows, mask in alike(seen):
-            x = values[rows] * mask
-            views = sights(self.primitive, self.timings, self.noise.ratio, mask)
-            first = {t.unit: v for t, v in zip(self.timings, views, strict=True)}
-            errors = {unit: view.errors(x) for unit, view in first.items()}
-            pairs = zip(self.timings, views, strict=True)
-            yield Group(rows, x, views, [v.sums(errors[t.unit], *x.shape[:2]) for t, v in pairs])
+        """What the movements say of θ."""
+        raise NotImplementedError
 
     def likelihood(self, sums: Sums) -> tuple[Tensor, Tensor]:
         """Precision and linear term of θ."""
@@ -89,23 +89,53 @@ class Cases:
             return torch.zeros_like(group.rows)
         return self.evidence(group).logsumexp(1).argmax(0)
 
-    def chosen(
-        self, values: Tensor, seen: Tensor, count: int
-    ) -> Iterator[tuple[Tensor, Tensor, Case]]:
-        """Timings and scales resampled to ``count``: rows, which components they are, p(θ | x).
+    def picked(self, group: Group, count: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+        """Timings and scales resampled to ``count``: timing, scale, movements, components of these.
 
         One alone is the likeliest timing, with the usual scale: whole movements tell their θ.
         """
+        if count == 1:
+            picks = self.likeliest(group)[None]
+        else:
+            picks = resample(self.evidence(group).flatten(0, 1), count)
+        for i in picks.unique().tolist():
+            some, one = (picks == i).any(0), self.scales.new_ones(())
+            timing, scale = divmod(i, 1 if count == 1 else len(self.scales))
+            yield timing, one if count == 1 else self.scales[scale], some, picks[:, some] == i
+
+    def posterior(self, group: Group, timing: int, scale: Tensor, some: Tensor) -> Population:
+        """p(θ | x) of some movements of a group."""
+        p = self.population
+        prior = Population(p.mean, scale * p.factors, scale * p.private)
+        return prior.condition(*self.likelihood(group.sums[timing].of_movements(some)))
+
+
+@dataclass(frozen=True)
+class Cases(Unknowns):
+    """Timings and scales of movements whose channels are seen as they are."""
+
+    def groups(
+        self,
+        values: Float[Tensor, "sequence time channel"],
+        seen: Bool[Tensor, "sequence time channel"],
+    ) -> Iterator[Sighted]:
+        """What the movements say of θ; the errors of timings of one tempo are the same."""
+        for rows, mask in alike(seen):
+            x = values[rows] * mask
+            views = sights(self.primitive, self.timings, self.noise.ratio, mask)
+            first = {t.unit: v for t, v in zip(self.timings, views, strict=True)}
+            errors = {unit: view.errors(x) for unit, view in first.items()}
+            pairs = zip(self.timings, views, strict=True)
+            sums = [v.sums(errors[t.unit], *x.shape[:2]) for t, v in pairs]
+            yield Sighted(rows, x, sums, views)
+
+    def chosen(
+        self, values: Tensor, seen: Tensor, count: int
+    ) -> Iterator[tuple[Tensor, Tensor, Case]]:
+        """Rows, which of ``count`` components they are, and p(θ | x)."""
         for group in self.groups(values, seen):
-            if count == 1:
-                picks = self.likeliest(group)[None]
-            else:
-                picks = resample(self.evidence(group).flatten(0, 1), count)
-            for i in picks.unique().tolist():
-                some, one = (picks == i).any(0), self.scales.new_ones(())
-                timing, scale = divmod(i, 1 if count == 1 else len(self.scales))
-                s = one if count == 1 else self.scales[scale]
-                yield group.rows[some], picks[:, some] == i, self.case(group, timing, s, some)
+            for timing, scale, some, which in self.picked(group, count):
+                yield group.rows[some], which, self.case(group, timing, scale, some)
 
     def mixture(
         self, values: Tensor, seen: Tensor, count: int, render: Callable[[Case], Paths]
@@ -125,21 +155,16 @@ class Cases:
                 cases[row] = self.case(group, i, one, torch.tensor([j]))
         return [cases[row] for row in range(len(values))]
 
-    def case(self, group: Group, timing: int, scale: Tensor, some: Tensor) -> Case:
+    def case(self, group: Sighted, timing: int, scale: Tensor, some: Tensor) -> Case:
         """p(θ | x) of some movements of a group."""
-        prior, x = self._scaled(scale), group.x[some]
-        posterior = prior.condition(*self.likelihood(group.sums[timing].of_movements(some)))
-        return Case(posterior, group.sights[timing], self.timings[timing], x)
-
-    def _scaled(self, scale: Tensor) -> Population:
-        p = self.population
-        return Population(p.mean, scale * p.factors, scale * p.private)
+        posterior = self.posterior(group, timing, scale, some)
+        return Case(posterior, group.sights[timing], self.timings[timing], group.x[some])
 
 
 class Posteriors:
     """p(timing | x), p(scale | timing, x) and p(θ | timing, scale, x) of some movements."""
 
-    def __init__(self, cases: Cases, x: Tensor, seen: Tensor) -> None:
+    def __init__(self, cases: Unknowns, x: Tensor, seen: Tensor) -> None:
         """Weigh every timing and scale of every movement."""
         self.cases, self.groups = cases, list(cases.groups(x, seen))
         self.evidence = x.new_empty(len(cases.timings), len(cases.scales), len(x))

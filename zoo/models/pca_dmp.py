@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from pyro import poutine
 from torch import Tensor, nn
+from torch.distributions.transforms import ReshapeTransform
+from torch.nn import functional
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.dynamics.alignment import extremes
+from zoo.dynamics.cases import Posteriors
+from zoo.dynamics.components import Components, Paths
+from zoo.dynamics.projected import Projected, ProjectedLaw
+from zoo.dynamics.projection import Projection
+from zoo.dynamics.rollout import Timing
 from zoo.models import dmp, pca
+from zoo.models.baseline import seen_entries, seen_movements
+from zoo.models.learned_dmp import COMPONENTS
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior
+from zoo.types import Batch, Layout, Posterior, Sites
 
 __all__ = ["Config", "PcaDmp"]
 
@@ -46,20 +57,32 @@ class Config:
 
 
 class PcaDmp(nn.Module):
-    """Every principal component of the frames is one movement primitive, found in two stages.
+    r"""Every principal component of the frames is one movement primitive: a joint Gaussian program.
 
-    z_t ~ one primitive a component, as in ``dmp``;  x_t ~ N(W z_t + μ, σ²I) as in ``pca``
+    For every component, with timing, scale and θ drawn as in ``dmp``::
+
+        z_k = R θ_k + σ_k N ε_k + τ_k η_k,   ε, η ~ N(0, I)
+        x_t ~ N(W z_t + μ, σ²I)
+
+    Its parameters are point estimates, found in two stages: W, μ and σ by ``pca``, then p(θ) and
+    the noise of ``dmp`` from the components' paths; τ² is what their white noise has beyond that
+    of x. All else is inference in the one program. The guide is the exact posterior of timing,
+    scale and θ, with ε and η integrated out. Reconstructions, filled gaps and forecasts are
+    conditionals of the program, of all components together, with or without missing joints.
+    As in ``dmp``, an entry counts as ``information`` of an independent one, which tempers the
+    posterior; timings and scales are resampled to 16 components; reconstructions
+    take the likeliest timing and s = 1. Columns of W are orthogonal: components separate where
+    frames are observed whole or not at all, and missing joints couple them. Costs are the cube of
+    the frames observed, where coupled times that of the components.
+
+    Approximate are the demonstrations with missing joints that p(θ) is learned from or that are to
+    be changed (other goals, durations, switching): they enter by the components' mean given the
+    rest of their frame. Bands of changed movements count components as independent. What the
+    components leave out is white noise to it, as large along them, where in truth it is smooth and
+    beside them. ``noise`` is σ, ``epistemic`` the uncertainty of W z.
 
     Thesis Table 2, where it is the linear rival of ``ae-dmp``; Bitzer & Vijayakumar, *Latent spaces
-    for dynamic movement primitives*, Humanoids 2009, take the two steps apart in the same way. Both
-    parts are those of the zoo and are learned one after the other: the components know nothing of
-    time, the primitives nothing of what the components leave out. Each stage is in closed form;
-    both together are no exact inference in the joint program, and there is no guide. Forecasts,
-    missing sections, goals, durations and switching are those of ``dmp`` in the components, brought
-    back by W. Frames with missing joints enter by the mean of p(z_t | x_seen), whose variance is
-    not passed on. Draws keep what components have in common; the closed-form variance counts them
-    as independent. What the components leave out is white noise to it, where in truth it is smooth.
-
+    for dynamic movement primitives*, Humanoids 2009, take the two steps apart in the same way.
     Defaults: 5 components, 20 kernels (§5.3.2), α = 25, β = α/4.
     """
 
@@ -90,39 +113,68 @@ class PcaDmp(nn.Module):
         self.dmp.condition(
             replace(data, values=z, mask=mask, channels=latent.channels, units=latent.units)
         )
+        least = self._least / self.dmp.noise.square()
+        self.dmp.ratio = torch.maximum(self.dmp.ratio, torch.where(least.isfinite(), least, 0.0))
 
     def forward(self, batch: Batch) -> Float[Tensor, "*sample sequence frame channel"]:
-        """The generative program of the whole movements of ``batch``."""
-        z, mask = self._components(batch.movements, batch.movement_mask)
-        latent = replace(batch, movements=z, movement_mask=mask)
-        with self.dmp.movements(latent):
-            law, _ = self.dmp.prior(latent)
-            path = pyro.sample("z", law)
-            mean: Tensor = path @ self.pca.loading.T + self.pca.mean
-            x = dist.Normal(mean, self.pca.noise)
-            if batch.movement_mask is not None:
-                x = x.mask(batch.movement_mask)
-            pyro.sample("x", x.to_event(2), obs=batch.given(batch.movements))
-        return mean
+        """The generative program of the whole movements of ``batch``; returns W R θ + μ."""
+        seen, view = seen_movements(batch), self._projection
+        blank = batch.movements.new_zeros(*seen.shape[:2], self.config.latent_dim)
+        with self.dmp.movements(batch):
+            law, path = self.dmp.prior(replace(batch, movements=blank, movement_mask=None))
+            (timing,) = _whole(seen)
+            x = ProjectedLaw(view, self.dmp.primitive, timing, law.θ, seen)
+            with poutine.scale(scale=float(self.dmp.information)):
+                pyro.sample("x", x, obs=batch.given(batch.movements))
+        return view.shown(path)
+
+    def posterior_sites(self, batch: Batch) -> Sites:
+        """p(timing, scale, θ | x), exactly."""
+        x, seen = batch.movements, seen_movements(batch)
+        unknown = self._unknowns(seen, _whole(seen))
+        given = Posteriors(unknown, x, seen)
+
+        def private(drawn: Mapping[str, Tensor]) -> dist.TorchDistribution:
+            law = given.private(drawn)
+            parts = ReshapeTransform(law.event_shape, self.dmp.mean.shape)
+            found: dist.TorchDistribution = dist.TransformedDistribution(law, [parts])
+            return found
+
+        of = {"timing": given.timing, "scale": given.scale}
+        if self.dmp.factors.shape[-1]:
+            of["shared"] = given.shared
+        of["private"] = private
+        return Sites(plate="movements", size=batch.total_sequences, rows=len(x), of=of)
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Roll-outs of the components."""
-        return self.dmp.reconstruct(self._latent(batch), None, draws=draws)
+        seen = seen_entries(batch)
+        unknown = self._unknowns(seen, _whole(seen))
+        parts = Components.empty(1, batch.values[..., : self.config.latent_dim])
+        for rows, which, z in unknown.latent(batch.values, seen, 1, fresh=True):
+            variance = z.covariance.diagonal(dim1=-2, dim2=-1).expand_as(z.mean)
+            parts.put(rows, which, Paths(z.mean, variance, z.draw))
+        return _predictive(parts, None, draws)
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """Roll-outs of the components, brought back to the channels."""
-        return self._observed(self.dmp.reconstruct(self._latent(batch), None, draws=draws))
+        """Fresh roll-outs of the parameters that the movements have."""
+        seen = seen_entries(batch)
+        parts = self._shown(batch.values, seen, _whole(seen), 1, fresh=True)
+        return _predictive(parts, self.pca.noise, draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """Missing joints by the components, missing frames by the primitives."""
-        return self._observed(self.dmp.impute(self._latent(batch), None, draws=draws))
+        """The paths given the entries seen."""
+        seen = seen_entries(batch)
+        return self._filled(batch.values, seen, _whole(seen), 0, draws)
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """The components' paths given their first frames, brought back."""
-        latent = self._latent(batch)
-        return self._observed(self.dmp.forecast(latent, None, horizon=horizon, draws=draws))
+        """The paths given their first frames, after these."""
+        pad, known = (0, 0, 0, horizon), batch.values.shape[1]
+        seen = functional.pad(seen_entries(batch), pad)
+        values = functional.pad(batch.values, pad)
+        return self._filled(values, seen, self._timings(known), known, draws)
 
     def generate(
         self,
@@ -147,7 +199,50 @@ class PcaDmp(nn.Module):
             steps=steps,
             draws=draws,
         )
-        return self._observed(made)
+        return self._changed(made)
+
+    @property
+    def _least(self) -> Float[Tensor, " latent"]:
+        """Variances of the noise of x along the components; infinite where no channel shows one."""
+        f = self.pca.factors()
+        least: Tensor = (f.noise / torch.linalg.vector_norm(f.loading, dim=0)).square()
+        return least
+
+    @property
+    def _projection(self) -> Projection:
+        """Components as the channels show them."""
+        f, force = self.pca.factors(), self.dmp.noise.square()
+        white = (force * self.dmp.ratio - self._least).clamp_min(0)
+        return Projection(f.loading, f.mean, f.noise, force, white)
+
+    def _unknowns(self, seen: Tensor, timings: list[Timing]) -> Projected:
+        d, information = self.dmp, float(self.dmp.information)
+        return Projected.of(
+            self._projection, d.primitive, d.population, information, timings, d.scales, seen
+        )
+
+    def _timings(self, known: int) -> list[Timing]:
+        """Durations of training movements that last as long."""
+        timings = [Timing(unit) for unit in self.dmp.units.tolist()]
+        going = [t for t in timings if t.unit >= known]
+        return going or [max(timings, key=lambda t: t.unit)]
+
+    def _filled(
+        self, values: Tensor, seen: Tensor, timings: list[Timing], begin: int, draws: int
+    ) -> Predictive:
+        """The posterior predictive from frame ``begin`` on."""
+        alone = len(timings) * len(self.dmp.scales) == 1
+        parts = self._shown(values, seen, timings, 1 if alone else COMPONENTS, fresh=False)
+        return _predictive(parts.after(begin), self.pca.noise, draws)
+
+    def _shown(
+        self, values: Tensor, seen: Tensor, timings: list[Timing], count: int, *, fresh: bool
+    ) -> Components:
+        """W z + μ as a mixture over timings and scales."""
+        parts, unknown = Components.empty(count, values), self._unknowns(seen, timings)
+        for rows, which, z in unknown.latent(values, seen, count, fresh=fresh):
+            parts.put(rows, which, unknown.projection.paths(z))
+        return parts
 
     @property
     def _white(self) -> Float[Tensor, " latent"]:
@@ -157,9 +252,13 @@ class PcaDmp(nn.Module):
     def _components(
         self, values: Float[Tensor, "sequence time channel"], mask: Tensor | None
     ) -> tuple[Float[Tensor, "sequence time latent"], Tensor]:
-        """Mean of p(z_t | x_seen), 0 and False where nothing was seen."""
+        """Least squares of frames observed whole; 0 and False where nothing was observed.
+
+        Of others the mean of p(z_t | x_seen), as far from 0 as least squares are.
+        """
         rows = None if mask is None else mask.flatten(0, 1)
         z, _ = self.pca.factors().posterior(values.flatten(0, 1), rows)
+        z = z * (1 + torch.where(self._least.isfinite(), self._least, 0.0))
         seen = torch.ones_like(values[..., :1], dtype=torch.bool)
         if mask is not None:
             seen = mask.any(-1, keepdim=True)
@@ -169,18 +268,27 @@ class PcaDmp(nn.Module):
         z, seen = self._components(batch.values, batch.mask)
         return replace(batch, values=z, mask=None if batch.mask is None else seen)
 
-    def _noise(self, std: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch channel"]:
-        """σ of the channels whose components have the standard deviations ``std``."""
-        return (self._spread(std).square() + self.pca.noise.square()).sqrt()
-
-    def _spread(self, std: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch channel"]:
-        return (std.square() @ self.pca.loading.square().T).sqrt()
-
-    def _observed(self, latent: Predictive) -> Predictive:
-        w, μ = self.pca.loading, self.pca.mean
+    def _changed(self, latent: Predictive) -> Predictive:
+        """W z + μ of components counted as independent."""
+        view = self._projection
+        square = view.loading.square().T
+        spread = None if latent.epistemic is None else latent.epistemic.square() @ square
         return Predictive(
-            location=latent.location @ w.T + μ,
-            noise=self._noise(self._white),
-            epistemic=None if latent.epistemic is None else self._spread(latent.epistemic),
-            draws=latent.redrawn(lambda z: z @ w.T + μ, len(w)),
+            location=view.shown(latent.location),
+            noise=(view.white @ square + view.noise.square()).sqrt(),
+            epistemic=None if spread is None else spread.sqrt(),
+            draws=latent.redrawn(view.shown, len(view.mean)),
         )
+
+
+def _predictive(parts: Components, noise: Tensor | None, draws: int) -> Predictive:
+    return Predictive(
+        location=parts.mean,
+        noise=noise,
+        epistemic=parts.variance.sqrt(),
+        draws=parts.draws(draws),
+    )
+
+
+def _whole(seen: Bool[Tensor, "sequence frame channel"]) -> list[Timing]:
+    return [Timing(seen.shape[1] - 1.0)]
