@@ -57,7 +57,8 @@ plt.show()
 #
 # The forecast is a distribution. Its mean is a guess; its bands are a promise. The latent state of
 # the frames seen is filtered, the force and the goal of the primitive are conditioned on it, and
-# joint futures are drawn and decoded.
+# joint futures are drawn and decoded. What conditions them is a prior over whole latent
+# paths, learned from the training movements after the networks (see `zoo card vae-dmp`).
 
 # %%
 run = zoo.fit(zoo.create("vae-dmp", train, latent_dim=5, max_steps=4000), train, val=val)
@@ -69,7 +70,7 @@ forecast_bands(prediction, test.values, seen=seen)
 #
 # ## Is the promise kept?
 #
-# A model judges its own spread on movements it was trained on, and tends to be too sure. We
+# A model learns its own standard deviation from few movements, and tends to be too sure. We
 # correct it on **calibration movements** that neither training nor test has seen.
 
 # %%
@@ -87,7 +88,7 @@ reliability(
 # %% [markdown]
 # On the diagonal the bands hold what they promise **on average over all joints and lead times**: a
 # fast joint may still leave its band more often than a slow one. The bars are two standard errors
-# over trials, of which there are few. Now against what a sceptic would use: the
+# over trials, of which there are few. Now against baselines: the
 # mean of the training movements, the last value, an autoregression, the nearest neighbour.
 
 # %%

@@ -367,15 +367,17 @@ plt.show()
 # %% [markdown]
 # The three begin in different phases of a step, and each forecast goes on from where its own
 # stands. Bands are **not calibrated** here. How that compares with others is measured on all
-# sixteen walks, each foretold by models that never saw its trial: the *leaderboards*. There a plain
-# nearest neighbour is the rival to beat, and 90 % bands are calibrated on other trials. First a
-# long forecast, 100 frames seen and 200 to come at 120 Hz:
+# sixteen walks: the *leaderboards*. Of four parts of the walks one is judged, one calibrates the
+# bands, and models are trained on the other two. Nothing of the future is used, not even its mean;
+# the literature's protocol, which takes each walk less its own mean over all frames, has a board of
+# its own (`walk-setup-2-published`). The rivals to beat are a nearest neighbour and a linear
+# autoregression. First a long forecast, 100 frames observed and 200 to come at 120 Hz:
 
 # %%
 stored("leaderboard_walk-setup-2")
 
 # %% [markdown]
-# Then almost nothing seen, three frames, and 297 to come:
+# Then almost nothing, three frames observed and 297 to come:
 
 # %%
 stored("leaderboard_walk-setup-1")
@@ -394,8 +396,8 @@ stored("leaderboard_walk-missing-leg")
 # draws of what the model holds possible. The same page comes from the command line by `zoo play RUN
 # --onto 3`, as a file that needs no network.
 #
-# The forecast's spread can be honest, because there is a truth: the bands are recalibrated on
-# trials that neither training nor test has seen.
+# Whether the bands of the forecast hold can be tested, because there is a truth: they are
+# recalibrated on trials that are in neither training nor test.
 
 # %%
 seen = 10
