@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import math
@@ -17,7 +18,13 @@ from zoo import capabilities
 from zoo.assembly import assemble, options
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import DamagedRunError, NotCapableError, UnknownNameError
+from zoo.errors import (
+    DamagedRunError,
+    NoJointSamplesError,
+    NoSpreadError,
+    NotCapableError,
+    UnknownNameError,
+)
 from zoo.inference.elbo import tight_bound
 from zoo.inference.loader import Loader
 from zoo.prediction import Prediction
@@ -200,6 +207,15 @@ def test_predictions_repeat_with_their_seed(name: str) -> None:
     run = run_of(name)
     for task in run.capabilities:
         assert torch.equal(answer(run, task).mean, answer(run, task).mean)
+
+
+@pytest.mark.parametrize("name", CATALOGUE.names(can="forecast"))
+@pytest.mark.parametrize("draws", [1, 6])
+def test_a_forecast_of_few_draws_has_that_many(name: str, draws: int) -> None:
+    forecast = run_of(name).forecast(movements().first(12), horizon=5, draws=draws)
+    assert bool(forecast.mean.isfinite().all())
+    with contextlib.suppress(NoSpreadError, NoJointSamplesError):
+        assert bool(forecast.sample(draws).isfinite().all())
 
 
 @every

@@ -27,7 +27,7 @@ class Paths:
 
 @dataclass(frozen=True)
 class Components:
-    """Moments of every component; draw j of the mixture is of component j mod their number."""
+    """Moments of every component; draws are of all in turn, or of some from first to last."""
 
     mean: Float[Tensor, "component sequence time channel"]
     variance: Float[Tensor, "component sequence time channel"]
@@ -71,12 +71,21 @@ class Components:
 
         def make() -> Tensor:
             draws = self.mean.new_zeros(count, *self.mean.shape[1:])
+            owner = _owners(count, len(self.mean))
             for component, rows, here, draw in self.pieces:
-                some = draws[component :: len(self.mean)]
-                some[:, rows] = draw(len(some))[:, here, self.begin :]
+                mine = (owner == component).nonzero()
+                if len(mine):
+                    draws[mine, rows] = draw(len(mine))[:, here, self.begin :]
             return draws
 
         return Deferred((count, *self.mean.shape[1:]), make)
+
+
+def _owners(count: int, components: int) -> Int[Tensor, " draw"]:
+    """Which component each draw is of: all in turn, or evenly spaced ones where draws are fewer."""
+    if count >= components:
+        return torch.arange(count) % components
+    return (torch.arange(count) * components + components // 2) // count
 
 
 def resample(
