@@ -168,7 +168,7 @@ def _result(
 
 
 def _details(board: Board, data: Sequences, models: Sequence[str]) -> dict[str, Any]:
-    """What a reader may want to compute with; coverage in whole per cent."""
+    """What a reader may want to compute with; coverage in per cent."""
     asked = board.protocol
     return {
         "protocol": asked.protocol,

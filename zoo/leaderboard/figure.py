@@ -50,7 +50,8 @@ def _errors(axes: Axes, board: Board) -> None:
         found = interval(values)
         axes.scatter(values, np.full(len(values), place), s=9, color="0.7", zorder=1)
         axes.errorbar(found.mean, place, xerr=found.half, fmt="o", color="C0", capsize=3, zorder=2)
-    axes.set(xlabel=f"MSE / {unit}", title="Error: groups in grey, mean ± 95 %")
+    axes.set(xlabel=f"MSE / {unit}")
+    axes.set_title("Error: groups in grey, mean ± 95 %", fontsize=9)
     if any((board.mse(m) <= 0).any() for m in board.models):
         return
     axes.set_xscale("log")
@@ -80,7 +81,5 @@ def _bands(axes: Axes, board: Board) -> None:
             )
     axes.axvspan(87, 93, color="0.92", zorder=0)
     axes.axvline(90, color="0.6", lw=1, zorder=0)
-    axes.set(
-        xlabel="recorded values inside the 90 % band / %",
-        title="Orange: raw, green: calibrated; groups pale, mean ± SD",
-    )
+    axes.set(xlabel="recorded values inside the 90 % band / %")
+    axes.set_title("Orange: raw, green: calibrated; groups pale, mean ± SD", fontsize=9)

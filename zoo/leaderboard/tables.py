@@ -91,9 +91,20 @@ class Board:
         return None if found is None else found[:, np.isin(self.channels, self.asked)]
 
     def coverage(self, model: str) -> dict[str, Any]:
-        """Coverage in whole per cent by kind, group, asked channel and block; None is unasked."""
+        """Coverage in per cent by kind: of every group's asked channels, and of its blocks.
+
+        None where nothing was asked.
+        """
         inside = np.isin(self.channels, self.asked)
-        return {kind: _whole(cube[:, inside]) for kind, cube in self.models[model].coverage.items()}
+        cubes = self.models[model].coverage.items()
+        asked = {kind: np.ma.masked_invalid(cube[:, inside]) for kind, cube in cubes}
+        return {
+            kind: {
+                "by group and channel": cube.mean(2).round(1).tolist(),
+                "by group and block": cube.mean(1).round(1).tolist(),
+            }
+            for kind, cube in asked.items()
+        }
 
 
 def error_columns(board: Board) -> tuple[str, ...]:
@@ -191,13 +202,6 @@ def _share(found: Interval | None) -> str:
     if found is None:
         return ""
     return f"{found.mean:.1f} ± {found.half:.1f} % (SD {found.sd:.1f})"
-
-
-def _whole(cube: Cube) -> list[Any]:
-    return [
-        [[None if math.isnan(v) else round(v) for v in row] for row in rows]
-        for rows in cube.tolist()
-    ]
 
 
 def _squared(unit: str) -> str:
