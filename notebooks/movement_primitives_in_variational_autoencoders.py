@@ -377,12 +377,6 @@ plt.show()
 stored("leaderboard_walk-setup-2")
 
 # %% [markdown]
-# Then almost nothing, three frames observed and 297 to come:
-
-# %%
-stored("leaderboard_walk-setup-1")
-
-# %% [markdown]
 # And a leg that was not recorded:
 
 # %%
