@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -49,7 +50,7 @@ class Sighted(Group):
 
 
 @dataclass(frozen=True)
-class Unknowns:
+class Unknowns(ABC):
     """Equally likely timings and scales s of the deviations from the mean movement.
 
     Every entry counts as ``information`` of an independent one.
@@ -62,13 +63,14 @@ class Unknowns:
     timings: Sequence[Timing]
     scales: Float[Tensor, " scale"]
 
+    @abstractmethod
     def groups(
         self,
         values: Float[Tensor, "sequence time channel"],
         seen: Bool[Tensor, "sequence time channel"],
     ) -> Iterator[Group]:
         """What the movements say of θ."""
-        raise NotImplementedError
+        ...
 
     def likelihood(self, sums: Sums) -> tuple[Tensor, Tensor]:
         """Precision and linear term of θ."""
