@@ -96,8 +96,10 @@ def test_a_leaderboard_on_own_movements(tmp_path: Path, monkeypatch: pytest.Monk
     stored = json.loads(Path("results/leaderboard_robot-arm-reaching-10-8.json").read_text())
     assert stored["command"] == f"zoo leaderboard {question} --models mean --folds 3"
     assert stored["source"] == "own" and len(stored["details"]["groups"]) == 12
-    cube = np.array(stored["details"]["coverage_90"]["mean"]["calibrated"])
-    assert cube.shape == (12, 6, 6)
+    coverage = stored["details"]["coverage_90"]["mean"]["calibrated"]
+    assert np.shape(coverage["by group and channel"]) == (12, len(stored["details"]["channels"]))
+    assert np.shape(coverage["by group and block"]) == (12, len(stored["details"]["blocks"]))
+    assert stored["details"]["blocks"][-1][1] == 18
 
 
 def test_protocols_say_which_they_are(capsys: pytest.CaptureFixture[str]) -> None:
