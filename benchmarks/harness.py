@@ -14,6 +14,8 @@ from typing import Any, Literal
 
 import torch
 
+from zoo.experiments.result import commit
+
 __all__ = ["Timings", "interleave", "ratio", "report", "store", "versions"]
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
@@ -89,6 +91,7 @@ def store(
         "name": name,
         "label": label,
         "seed": seed,
+        "commit": commit(),
         "versions": versions(*libraries),
         "machine": {
             "cores": os.cpu_count(),

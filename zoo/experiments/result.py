@@ -6,6 +6,7 @@ import difflib
 import json
 import os
 import platform
+import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,8 +24,17 @@ from zoo.experiments.kept import timed
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["EXPERIMENTS", "Experiment", "Result", "Section", "run_experiment", "write_result"]
+__all__ = [
+    "EXPERIMENTS",
+    "Experiment",
+    "Result",
+    "Section",
+    "commit",
+    "run_experiment",
+    "write_result",
+]
 
+CODE = ("zoo", "guides", "datasets", "benchmarks")
 Source = Literal["thesis", "public", "simulated", "own"]
 
 
@@ -100,6 +110,7 @@ class Result:
                 for c in self.cards
             ],
             "versions": {n: version(n) for n in ("movezoo", "torch", "pyro-ppl", "numpy")},
+            "commit": commit(),
             "machine": {"cores": os.cpu_count(), "python": platform.python_version()},
         }
 
@@ -158,6 +169,28 @@ EXPERIMENTS: dict[str, Experiment] = {
         module="zoo.experiments.e6_5",
     ),
 }
+
+
+def commit() -> str:
+    """The commit of the checkout that this package is in, changes of its code named; "" if none.
+
+    >>> isinstance(commit(), str)
+    True
+    """
+    here = Path(__file__).resolve().parents[2]
+    try:
+        if not (here / ".git").exists():
+            return ""
+        head = _git(here, "rev-parse", "--short=12", "HEAD")
+        changed = _git(here, "status", "--porcelain", "--", *CODE)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return f"{head}, with changes that are not committed" if changed else head
+
+
+def _git(folder: Path, *words: str) -> str:
+    command = ["git", "-C", str(folder), *words]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def run_experiment(
