@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from zoo.version import __version__
+
 if TYPE_CHECKING:
     from zoo.cards import card
     from zoo.catalogue import list_models
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from zoo.prediction import Prediction
     from zoo.questions import Setup
     from zoo.run import Run, create, evaluate, load
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Ensemble",

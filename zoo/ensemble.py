@@ -21,9 +21,8 @@ from zoo.fitting import fit
 from zoo.mixtures import pooled
 from zoo.prediction import Prediction, Recalibration
 from zoo.questions import Setup
-from zoo.run import Run
+from zoo.run import Run, load
 from zoo.rundir import Resume
-from zoo.storage import load_run
 from zoo.tasks import Method, corrections
 
 __all__ = ["Ensemble", "fit_ensemble"]
@@ -190,7 +189,7 @@ class Ensemble:
             raise DamagedRunError(
                 f"{folder}/ensemble.json does not describe an ensemble: {error}"
             ) from error
-        members = tuple(load_run(folder / f"member-{i}") for i in range(index.members))
+        members = tuple(load(folder / f"member-{i}") for i in range(index.members))
         return cls(members=members, recalibrations=found, calibrated_on=index.calibrated_on)
 
     def _pooled(

@@ -69,7 +69,7 @@ def fit(
 
 def _kept(assembly: Assembly, folder: Path, told: bool) -> Run:
     """The finished run of a folder as the training left it."""
-    run = load_run(folder, device=assembly.device)
+    run = Run(**vars(load_run(folder, device=assembly.device)))
     if told:
         done = f"{run.name}: trained before in {run.seconds:.0f} s, taken from {folder}"
         print(done, file=sys.stderr)

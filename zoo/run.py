@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,17 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
-from zoo.assembly import Assembly, create
+from zoo.assembly import create
 from zoo.datasets.records import Pairs, Sequences
-from zoo.datasets.scaling import Scaler
 from zoo.errors import NotCapableError
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
 from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
-from zoo.prediction import Prediction, Predictive, Recalibration
+from zoo.prediction import Prediction, Predictive
 from zoo.questions import Setup
+from zoo.record import Record
 from zoo.tasks import Method, Trained, corrections, posed
 from zoo.types import Batch, Posterior
 
@@ -29,24 +29,11 @@ __all__ = ["Run", "create", "evaluate", "load"]
 
 
 @dataclass(kw_only=True)
-class Run:
+class Run(Record):
     """A trained model: predictions in the data's own units, calibration, saving.
 
-    ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
-    ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed,
-    as ``calibrated_on`` are of those that bands were calibrated on;
-    ``made_of`` all that determined it (:mod:`zoo.fingerprint`), empty where it was trained without
-    a folder; ``seconds`` the wall clock of its training.
+    What is kept of it is told by :class:`~zoo.record.Record`.
     """
-
-    assembly: Assembly
-    scaler: Scaler
-    history: list[dict[str, Any]]
-    seconds: float
-    trained_on: dict[str, Any]
-    made_of: dict[str, str] = field(default_factory=dict)
-    recalibrations: dict[str, Recalibration] = field(default_factory=dict)
-    calibrated_on: list[str] = field(default_factory=list)
 
     def __repr__(self) -> str:
         """Model, data, tasks and calibration in one line."""
@@ -261,4 +248,4 @@ def load(folder: str | Path) -> Run:
     """A run that :meth:`Run.save` wrote; a damaged or foreign folder is refused with its reason."""
     from zoo.storage import load_run
 
-    return load_run(Path(folder))
+    return Run(**vars(load_run(Path(folder))))

@@ -13,7 +13,6 @@ import torch
 from pydantic import TypeAdapter
 from torch import Tensor
 
-import zoo
 from zoo import archive
 from zoo.assembly import assemble
 from zoo.catalogue import CATALOGUE
@@ -21,8 +20,9 @@ from zoo.datasets.scaling import Scaler
 from zoo.errors import DamagedRunError, RunExistsError
 from zoo.evaluation.calibration import recalibration_from_state
 from zoo.inference.train import Builds
-from zoo.run import Run
+from zoo.record import Record
 from zoo.types import Layout
+from zoo.version import __version__
 
 __all__ = ["FORMAT_VERSION", "load_run", "made_of_run", "save_run"]
 
@@ -54,7 +54,7 @@ class _Index:
     versions: dict[str, str]
 
 
-def save_run(run: Run, folder: Path, *, overwrite: bool = False) -> Path:
+def save_run(run: Record, folder: Path, *, overwrite: bool = False) -> Path:
     """Write a run so that :func:`load_run` gives back the same predictions, bit for bit.
 
     Another run in ``folder`` is replaced only where ``overwrite`` says so; the same training, with
@@ -80,13 +80,13 @@ def save_run(run: Run, folder: Path, *, overwrite: bool = False) -> Path:
         "made_of": run.made_of,
         "recalibrations": corrections,
         "calibrated_on": run.calibrated_on,
-        "versions": {"movezoo": zoo.__version__, **{n: installed(n) for n in _LIBRARIES}},
+        "versions": {"movezoo": __version__, **{n: installed(n) for n in _LIBRARIES}},
     }
     archive.write(folder, "run", meta, tensors, version=FORMAT_VERSION)
     return folder
 
 
-def load_run(folder: Path, *, device: str = "cpu") -> Run:
+def load_run(folder: Path, *, device: str = "cpu") -> Record:
     """Read a run; what is damaged, foreign or of another format version is refused."""
     meta, tensors = archive.read(folder, "run", version=FORMAT_VERSION)
     try:
@@ -103,13 +103,13 @@ def made_of_run(folder: Path) -> dict[str, str]:
     return found
 
 
-def _check_same(folder: Path, run: Run, tensors: dict[str, Tensor]) -> None:
+def _check_same(folder: Path, run: Record, tensors: dict[str, Tensor]) -> None:
     """Refuse to replace a run whose training was another."""
     try:
         meta, kept = archive.read(folder, "run", version=FORMAT_VERSION)
     except DamagedRunError as error:
         raise RunExistsError(f"{error}; save(..., overwrite=True) replaces it") from None
-    same = meta["entry"] == run.name and set(tensors) == {
+    same = meta["entry"] == run.assembly.entry.name and set(tensors) == {
         k for k in kept if not k.startswith("recalibration.")
     }
     if not (same and all(_equal(v, kept[k]) for k, v in tensors.items())):
@@ -123,7 +123,7 @@ def _equal(one: Tensor, other: Tensor) -> bool:
     return one.dtype == other.dtype and torch.equal(one.detach().cpu(), other)
 
 
-def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
+def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Record:
     entry, layout = CATALOGUE[index.entry], index.layout
     assembly = assemble(entry, layout, index.settings, seed=index.seed, device=device)
     parts = {"model": assembly.model, "guide": assembly.guide}
@@ -134,7 +134,7 @@ def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Run:
             module.build()
         archive.restore(module, name, tensors)
         module.eval()
-    return Run(
+    return Record(
         assembly=assembly,
         scaler=_scaler(index),
         history=index.history,

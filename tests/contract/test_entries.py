@@ -6,6 +6,7 @@ import contextlib
 import copy
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pyro.poutine as poutine
@@ -18,6 +19,7 @@ from zoo import capabilities
 from zoo.assembly import assemble, options
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.scaling import Scaler
 from zoo.errors import (
     DamagedRunError,
     NoJointSamplesError,
@@ -125,9 +127,7 @@ def test_unknown_setting_names_the_nearest(name: str) -> None:
 def test_every_parameter_gets_a_gradient(name: str) -> None:
     assembly = assembly_of(CATALOGUE[name])
     model, guide = copy.deepcopy((assembly.model, assembly.guide))
-    data = zoo.run.Scaler.fit(data_of(assembly.entry), assembly.scaling).apply(
-        data_of(assembly.entry)
-    )
+    data = Scaler.fit(data_of(assembly.entry), assembly.scaling).apply(data_of(assembly.entry))
     strategy = assembly.inference
     loader = Loader(
         data.to(dtype=assembly.dtype),
@@ -194,7 +194,7 @@ def test_the_spread_is_honest_or_refused(name: str) -> None:
     for task in set(run.capabilities) - {"represent"}:
         prediction = answer(run, task)
         if not prediction.has_spread:
-            with pytest.raises(zoo.prediction.NoSpreadError):
+            with pytest.raises(NoSpreadError):
                 _ = prediction.std
             continue
         low, high = prediction.interval(0.9)
@@ -288,7 +288,7 @@ def test_missing_entries_are_honoured_or_refused_by_name(name: str) -> None:
     other = {"values": torch.where(holed.mask, filled, 99.0)}
     if isinstance(holed, Pairs):
         other = {"targets": torch.where(holed.mask, filled, 99.0)}
-    poisoned = zoo.run.replace(holed, **other)
+    poisoned = replace(holed, **other)
     check_equal(tensors_of(run), tensors_of(zoo.fit(assembly_of(entry), poisoned)))
 
 
@@ -302,7 +302,7 @@ def test_wrong_data_are_refused_with_names(name: str) -> None:
             run.regress(rng.normal(size=(4, 7)))
         return
     other = Sequences.from_arrays(rng.normal(size=(2, FRAMES, CHANNELS + 1)), rate=30.0)
-    faster = zoo.run.replace(movements(), rate=60.0)
+    faster = replace(movements(), rate=60.0)
     task = next(t for t in ("reconstruct", "impute", "forecast") if t in run.capabilities)
     ask = {
         "reconstruct": run.reconstruct,

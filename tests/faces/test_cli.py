@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -216,7 +217,7 @@ def test_fitc_prints_both_noise_levels(
 def test_a_report_is_in_the_units_of_the_data() -> None:
     data = pairs()
     run = zoo.fit(zoo.create("gp", data, iterations=20), data)
-    louder = zoo.run.replace(data, targets=10 * data.targets)
+    louder = replace(data, targets=10 * data.targets)
     again = zoo.fit(zoo.create("gp", louder, iterations=20), louder)
     ratio = np.array(again.report()["noise_std"]) / np.array(run.report()["noise_std"])
     np.testing.assert_allclose(ratio, 10.0, rtol=1e-6)

@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = {
     "zoo.types": 0,
+    "zoo.version": 0,
     "zoo.errors": 0,
     "zoo.prediction": 0,
     "zoo.mixtures": 0,
@@ -37,6 +38,7 @@ FLOORS = {
     "zoo.fingerprint": 4,
     "zoo.rundir": 4,
     "zoo.training": 4,
+    "zoo.record": 4,
     "zoo.run": 4,
     "zoo.ensemble": 4,
     "zoo.storage": 4,
