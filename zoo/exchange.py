@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from zoo.assembly import Assembly
 from zoo.capabilities import FollowsPhase, Reaches, Reports
@@ -82,7 +82,7 @@ class Exchange:
                 rows = [i for i, n in enumerate(lengths) if n == length]
                 parts.append((rows, answer(whole(scaled[rows]), posterior, rows)))
                 frames[rows] = parts[-1][1].location.shape[2]
-        return parts[0][1] if len(parts) == 1 else _merge(parts, len(scaled)), frames
+        return parts[0][1] if len(parts) == 1 else _merge(parts), frames
 
     def report(self) -> dict[str, Any]:
         """What the model tells of itself, its standard deviations in the data's units."""
@@ -257,34 +257,12 @@ def _digest(*parts: NDArray[np.float64]) -> str:
     return content.hexdigest()
 
 
-def _merge(parts: Sequence[tuple[Sequence[int], Predictive]], count: int) -> Predictive:
+def _merge(parts: Sequence[tuple[Sequence[int], Predictive]]) -> Predictive:
     """Predictives of movements of several lengths as one, padded with zeros in time."""
-    answers = [p for _, p in parts]
-    rows = [list(r) for r, _ in parts]
-    noise = [None if p.noise is None else p.noise.expand_as(p.location) for p in answers]
-    epistemic = [
-        None if p.epistemic is None else p.epistemic.expand_as(p.location) for p in answers
-    ]
-    location = _padded(rows, [p.location for p in answers], count)
-    if location is None:
-        raise ValueError("a model gave no location")
-    return Predictive(
-        location=location,
-        noise=_padded(rows, noise, count),
-        epistemic=_padded(rows, epistemic, count),
-        joint=all(p.joint for p in answers),
-        draws=_padded(rows, [p.draws for p in answers], count),
-    )
+    longest = max(p.location.shape[2] for _, p in parts)
 
+    def padded(part: Tensor) -> Tensor:
+        return nn.functional.pad(part, (0, 0, 0, longest - part.shape[2]))
 
-def _padded(
-    rows: Sequence[list[int]], tensors: Sequence[Tensor | None], count: int
-) -> Tensor | None:
-    known = [t for t in tensors if t is not None]
-    if len(known) < len(tensors):
-        return None
-    longest = max(t.shape[2] for t in known)
-    out = known[0].new_zeros(known[0].shape[0], count, longest, known[0].shape[3])
-    for row, tensor in zip(rows, known, strict=True):
-        out[:, row, : tensor.shape[2]] = tensor
-    return out
+    order = torch.tensor([row for rows, _ in parts for row in rows]).argsort()
+    return Predictive.concat([p.map(padded) for _, p in parts]).rows(order)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import overload
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 __all__ = ["Deferred", "Predictive", "cdf", "log_density", "normal_score", "pooled", "quantile"]
@@ -120,19 +120,83 @@ class Predictive:
             draws=self.redrawn(lambda draws: draws * scale + shift),
         )
 
-    def redrawn(
-        self, change: Callable[[Tensor], Tensor], width: int | None = None
-    ) -> Deferred | Tensor | None:
-        """The draws after ``change``, deferred where they are; ``width`` is their new last size."""
+    def map(self, change: Callable[[Tensor], Tensor]) -> Predictive:
+        """The same ``change`` of location, noise, epistemic and draws: which entries, and where.
+
+        >>> p = Predictive(location=torch.arange(6.0).view(1, 2, 3), noise=torch.ones(3))
+        >>> p.map(lambda part: part[..., :1]).noise.shape
+        torch.Size([1, 2, 1])
+        """
+
+        def whole(part: Tensor | None) -> Tensor | None:
+            return None if part is None else change(part.expand_as(self.location))
+
+        return Predictive(
+            location=change(self.location),
+            noise=whole(self.noise),
+            epistemic=whole(self.epistemic),
+            joint=self.joint,
+            draws=self.redrawn(change),
+        )
+
+    def rows(self, index: slice | Int[Tensor, " some"]) -> Predictive:
+        """The distribution of some sequences or items, in the order of ``index``."""
+        return self.map(lambda part: part[:, index])
+
+    @classmethod
+    def concat(cls, parts: Sequence[Predictive]) -> Predictive:
+        """The distributions of several sets of sequences or items, one after the other.
+
+        Raises ValueError where one has noise, epistemic or draws and another has not.
+
+        >>> one = Predictive(location=torch.zeros(1, 2, 3), noise=torch.ones(3))
+        >>> Predictive.concat([one, one]).location.shape
+        torch.Size([1, 4, 3])
+        """
+        wide = [part.map(lambda tensor: tensor) for part in parts]
+        return cls(
+            location=torch.cat([p.location for p in wide], 1),
+            noise=_joined("noise", [p.noise for p in wide]),
+            epistemic=_joined("epistemic", [p.epistemic for p in wide]),
+            joint=all(p.joint for p in wide),
+            draws=_joined_draws([p._held for p in wide]),
+        )
+
+    def redrawn(self, change: Callable[[Tensor], Tensor]) -> Deferred | Tensor | None:
+        """The draws after ``change``, each by itself, deferred where they are."""
         if not isinstance(self._held, Deferred):
             return None if self._held is None else change(self._held)
-        *lead, last = self._held.shape
-        return self._held.map(change, (*lead, last if width is None else width))
+        count, *rest = self._held.shape
+        one = change(self.location.new_zeros(1, *rest))
+        return self._held.map(change, (count, *one.shape[1:]))
 
     @property
     def _held(self) -> Deferred | Tensor | None:
         held: Deferred | Tensor | None = self.__dict__["_draws"]
         return held
+
+
+def _joined(what: str, parts: Sequence[Tensor | None]) -> Tensor | None:
+    known = [part for part in parts if part is not None]
+    if known and len(known) < len(parts):
+        raise ValueError(f"{len(known)} of {len(parts)} distributions to be joined have {what}")
+    return torch.cat(known, 1) if known else None
+
+
+def _joined_draws(parts: Sequence[Deferred | Tensor | None]) -> Deferred | Tensor | None:
+    """Draws side by side, deferred where any are."""
+    if not any(isinstance(part, Deferred) for part in parts):
+        return _joined("draws", [part for part in parts if not isinstance(part, Deferred)])
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        raise ValueError(f"{len(known)} of {len(parts)} distributions to be joined have draws")
+    count, _, *rest = known[0].shape
+    shape = (count, sum(part.shape[1] for part in known), *rest)
+
+    def make() -> Tensor:
+        return torch.cat([p.tensor() if isinstance(p, Deferred) else p for p in known], 1)
+
+    return Deferred(shape, make, seed=0)
 
 
 def pooled(parts: Sequence[Predictive]) -> Predictive:

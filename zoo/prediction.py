@@ -216,6 +216,12 @@ class Prediction:
             )
         return self.names.index(name)
 
+    def rows(self, index: Tensor) -> Self:
+        """The prediction of some sequences or items, by their numbers or by a boolean each."""
+        where = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        lengths = None if self.lengths is None else self.lengths[where]
+        return replace(self, predictive=self.predictive.rows(where), lengths=lengths)
+
     def recalibrated(self, recalibration: Recalibration) -> Self:
         """This prediction with its spread corrected."""
         self._need_spread()

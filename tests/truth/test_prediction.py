@@ -13,6 +13,7 @@ from scipy import stats
 
 from zoo import mixtures
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
+from zoo.mixtures import Deferred
 from zoo.prediction import Prediction, Predictive
 
 SHAPE = (3, 4, 2)
@@ -184,3 +185,32 @@ def test_seconds_count_from_the_start_of_the_movement() -> None:
     later = replace(mixture(), offset=3)
     assert later.seconds is not None
     np.testing.assert_allclose(later.seconds.numpy(), [0.1, 4 / 30, 5 / 30, 0.2])
+
+
+@pytest.mark.parametrize("deferred", [False, True])
+def test_rows_and_concat_are_inverse(deferred: bool) -> None:
+    """Every part of a mixture, put together again from its rows in any order."""
+    torch.manual_seed(0)
+    paths = torch.randn(5, 4, 6, 2)
+    p = Predictive(
+        location=torch.randn(3, 4, 6, 2),
+        noise=torch.rand(2),
+        epistemic=torch.rand(3, 4, 1, 1),
+        draws=Deferred((5, 4, 6, 2), lambda: paths.clone()) if deferred else paths,
+    )
+    order = torch.tensor([2, 0, 3, 1])
+    parts = [p.rows(order[:1]), p.rows(order[1:3]), p.rows(order[3:])]
+    again = Predictive.concat(parts).rows(order.argsort())
+    assert torch.equal(again.location, p.location)
+    assert again.draws is not None and torch.equal(again.draws, paths)
+    assert again.noise is not None and torch.equal(again.noise, p.noise.expand(3, 4, 6, 2))
+    assert again.epistemic is not None
+    assert torch.equal(again.epistemic, p.epistemic.expand(3, 4, 6, 2))
+
+
+def test_what_one_part_lacks_cannot_be_joined() -> None:
+    """No spread is made up, and none is dropped."""
+    sure = Predictive(location=torch.zeros(1, 2, 3))
+    wide = Predictive(location=torch.zeros(1, 2, 3), noise=torch.ones(3))
+    with pytest.raises(ValueError, match="1 of 2 distributions to be joined have noise"):
+        Predictive.concat([sure, wide])

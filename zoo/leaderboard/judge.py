@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Self
 
@@ -80,7 +80,7 @@ def judged(
         for kind, answer in _answers(fold, prediction, truth, mask, groups).items():
             for group, inside in _members(fold.judged, groups).items():
                 rows = torch.tensor(fold.judged)[inside]
-                entry = _entry(kind, _rows(answer, inside), truth[rows], mask[rows])
+                entry = _entry(kind, answer.rows(inside), truth[rows], mask[rows])
                 found.setdefault(group, []).append(entry)
     order = [found[g] for g in dict.fromkeys(groups)]
     return Judged(
@@ -105,8 +105,8 @@ def _answers(
 ) -> dict[str, Prediction]:
     """The judged rows' prediction as it is and, by the prefix ``calibrated_``, corrected."""
     place = torch.arange(len(fold.calibration) + len(fold.judged))
-    known = _rows(prediction, place < len(fold.calibration))
-    asked = _rows(prediction, place >= len(fold.calibration))
+    known = prediction.rows(place < len(fold.calibration))
+    asked = prediction.rows(place >= len(fold.calibration))
     names = [str(groups[row]) for row in fold.calibration]
     if not asked.has_spread or len(set(names)) < 2:
         return {"": asked}
@@ -158,19 +158,3 @@ def _columns(found: Sequence[Mapping[str, float | Cube]]) -> dict[str, Cube]:
     """What every group has, stacked."""
     shared = [k for k in found[0] if all(k in each for each in found)]
     return {k: np.stack([np.asarray(each[k], dtype=np.float64) for each in found]) for k in shared}
-
-
-def _rows(prediction: Prediction, rows: Bool[Tensor, " row"]) -> Prediction:
-    p = prediction.predictive
-
-    def picked(part: Tensor | None) -> Tensor | None:
-        return None if part is None else part.expand_as(p.location)[:, rows]
-
-    chosen = replace(
-        p,
-        location=p.location[:, rows],
-        noise=picked(p.noise),
-        epistemic=picked(p.epistemic),
-        draws=None if p.draws is None else p.draws[:, rows],
-    )
-    return replace(prediction, predictive=chosen, lengths=None)

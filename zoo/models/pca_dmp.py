@@ -277,7 +277,7 @@ class PcaDmp(nn.Module):
             location=view.shown(latent.location),
             noise=(view.white @ square + view.noise.square()).sqrt(),
             epistemic=None if spread is None else spread.sqrt(),
-            draws=latent.redrawn(view.shown, len(view.mean)),
+            draws=latent.redrawn(view.shown),
         )
 
 
