@@ -35,6 +35,7 @@ from zoo.models.pca import Config as PcaConfig
 from zoo.models.vae_dmp import VaeDmp
 from zoo.prediction import Prediction
 from zoo.run import Run
+from zoo.tasks import answered
 from zoo.types import Batch, Layout, Posterior
 
 if TYPE_CHECKING:
@@ -197,8 +198,9 @@ def with_prior(run: Run, kind: type[VaeDmp]) -> Run:
 
 def judged(data: Sequences, fold: int) -> tuple[dict[str, dict[str, float]], list[NoiseShare], str]:
     """Scores of every arm on a fold; what ε carries of its movements; the shape of the mixture."""
-    asked, rows = protocol("walk-setup-2"), range(len(data))
+    rows = range(len(data))
     test = data[[i for i in rows if i % FOLDS == fold]]
+    question = protocol("walk-setup-2").question(test)
     train = data[[i for i in rows if i % FOLDS != fold]]
     run = zoo.fit(zoo.create("vae-dmp", train, seed=SEED, **SETTINGS), train)
     runs = {
@@ -206,10 +208,10 @@ def judged(data: Sequences, fold: int) -> tuple[dict[str, dict[str, float]], lis
         "vae-dmp: aggregated p(w), p(goal), ε": with_prior(run, AggregatedPrior),
         "vae-dmp: p(w), p(goal), ε of the program": with_prior(run, OwnPrior),
     }
-    found = {n: asked.answer(r, test, draws=DRAWS, seed=SEED) for n, r in runs.items()}
+    found = {n: answered(r, question, draws=DRAWS, seed=SEED) for n, r in runs.items()}
     for count in COMPONENTS:
         found[f"PCA-{count}: latent path prior"] = linear_forecast(train, test, count)
-    truth, mask = asked.truth(test)
+    truth, mask = question.truth, question.mask
     scores = {n: _scores(p, truth, mask) for n, p in found.items()}
     shape = ", ".join(f"{v:.2g}" for v in cast(Any, run.model).prior_shape.tolist())
     return scores, noise_share(run, test), shape

@@ -24,9 +24,10 @@ from zoo.inference.elbo import bound
 from zoo.inference.loader import Loader, stream, whole
 from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.prediction import Prediction, Predictive
+from zoo.questions import Setup, hide_joints, hide_section
 from zoo.run import Run
 from zoo.strategies import MarginalLikelihood
-from zoo.tasks import Setup, hide_joints, hide_section, trials
+from zoo.tasks import trials
 from zoo.types import Batch
 
 __all__ = [

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zoo.prediction import Predictive
-from zoo.types import Batch, Posterior
+from zoo.types import Batch, Posterior, Wishes
 
 __all__ = [
     "FollowsPhase",
@@ -85,18 +85,10 @@ class Generates(Protocol):
         batch: Batch,
         posterior: Posterior | None,
         *,
-        goal: Float[Tensor, "sequence channel"] | None,
-        duration: float,
-        onto: Batch | None,
-        start: int,
-        steps: int,
+        wishes: Wishes,
         draws: int,
     ) -> Predictive:
-        """Movements like ``batch``: ended at ``goal``, ``duration`` times as long, or switched.
-
-        Switching goes from ``batch`` to the movements ``onto``, from frame ``start`` over
-        ``steps`` frames, (89).
-        """
+        """Movements like ``batch``: ended at another goal, longer, or switched, as ``wishes``."""
         ...
 
 

@@ -254,7 +254,7 @@ def leaderboard(
     horizon: Annotated[int, typer.Option(help="With --data: frames to forecast.")] = 0,
     hidden: Annotated[
         str,
-        typer.Option(help="With --data: what the channels to impute begin with, commas between."),
+        typer.Option(help="With --data: channels or joints to impute, commas between."),
     ] = "",
     by: Annotated[str, typer.Option(help="With --data: group column of the folds.")] = "trial",
     jobs: Annotated[int, typer.Option(help="Processes, of one thread each.")] = 1,

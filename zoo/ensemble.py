@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 from torch import Tensor
 
 from zoo import archive
+from zoo.answering import Answers, Query
 from zoo.assembly import Assembly
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import DamagedRunError, NotCapableError
+from zoo.errors import DamagedRunError
 from zoo.evaluation.calibration import recalibration_from_state
-from zoo.exchange import check_unseen, fingerprints, question
 from zoo.fitting import fit
 from zoo.mixtures import pooled
 from zoo.prediction import Prediction, Recalibration
-from zoo.questions import Setup
 from zoo.run import Run, load
 from zoo.rundir import Resume
-from zoo.tasks import Method, corrections
 
 __all__ = ["Ensemble", "fit_ensemble"]
 
@@ -38,7 +35,7 @@ class _Index:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ensemble:
+class Ensemble(Answers):
     r"""Runs of one layout whose predictions are averaged as distributions.
 
     p(y | x) = 1/M Σ_m p_m(y | x)
@@ -83,77 +80,21 @@ class Ensemble:
     @property
     def trained_on(self) -> dict[str, Any]:
         """Names and fingerprints of all the data that a member was trained on."""
-        known = [run.trained_on for run in self.members]
-        return {
-            "name": ", ".join(dict.fromkeys(k["name"] for k in known)),
-            "fingerprints": sorted({f for k in known for f in k["fingerprints"]}),
-        }
+        names = dict.fromkeys(run.trained_on["name"] for run in self.members)
+        return {"name": ", ".join(names), "fingerprints": self.fingerprints}
 
-    def forecast(
-        self, data: Sequences, *, horizon: int, draws: int = 200, seed: int = 0
-    ) -> Prediction:
-        """The ``horizon`` frames after the movements in ``data``."""
-        return self._pooled(
-            "forecast", lambda r, s: r.forecast(data, horizon=horizon, draws=draws, seed=s), seed
-        )
+    @property
+    def fingerprints(self) -> list[str]:
+        """Those of the movements or items that a member saw in training."""
+        return sorted({f for run in self.members for f in run.fingerprints})
 
-    def reconstruct(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """The movements as the members reproduce them."""
-        return self._pooled(
-            "reconstruct", lambda r, s: r.reconstruct(data, draws=draws, seed=s), seed
-        )
-
-    def impute(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """All entries of the movements, those missing filled in."""
-        return self._pooled(
-            question("impute", data), lambda r, s: r.impute(data, draws=draws, seed=s), seed
-        )
-
-    def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """Targets of new inputs."""
-        return self._pooled("regress", lambda r, s: r.regress(data, draws=draws, seed=s), seed)
-
-    def generate(
-        self,
-        like: Sequences,
-        *,
-        goal: ArrayLike | None = None,
-        duration: float = 1.0,
-        onto: Sequences | None = None,
-        start: int = 0,
-        steps: int = 1,
-        draws: int = 200,
-        seed: int = 0,
-    ) -> Prediction:
-        """New movements after the demonstrations ``like``, as :meth:`zoo.run.Run.generate`."""
-
-        def generated(run: Run, member_seed: int) -> Prediction:
-            return run.generate(
-                like,
-                goal=goal,
-                duration=duration,
-                onto=onto,
-                start=start,
-                steps=steps,
-                draws=draws,
-                seed=member_seed,
-            )
-
-        return self._pooled("generate", generated, seed)
-
-    def calibrate(
-        self,
-        data: Pairs | Sequences,
-        *,
-        method: Method = "conformal",
-        tasks: Sequence[str] | None = None,
-        setup: Setup | None = None,
-    ) -> Ensemble:
-        """Fit and keep a correction of every spread on movements that no member saw."""
-        check_unseen(data, self.trained_on["fingerprints"], "calibration")
-        self.recalibrations.update(corrections(self, data, method, tasks, setup))
-        self.calibrated_on.extend(fingerprints(data))
-        return self
+    def uncorrected(self, query: Query) -> Prediction:
+        """The members' answers as an equal mixture, each with a seed of its own."""
+        found = [
+            run.uncorrected(replace(query, seed=query.seed + i))
+            for i, run in enumerate(self.members)
+        ]
+        return replace(found[0], predictive=pooled([p.predictive for p in found]))
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the members and the ensemble's calibration as folders of safetensors and JSON.
@@ -191,21 +132,6 @@ class Ensemble:
             ) from error
         members = tuple(load(folder / f"member-{i}") for i in range(index.members))
         return cls(members=members, recalibrations=found, calibrated_on=index.calibrated_on)
-
-    def _pooled(
-        self, task: str, predict: Callable[[Run, int], Prediction], seed: int
-    ) -> Prediction:
-        need = task.split()[0]
-        if need not in self.capabilities:
-            raise NotCapableError(
-                f"{self.name} cannot {need}; all its members can {', '.join(self.capabilities)}"
-            )
-        found = [predict(run, seed + i).raw for i, run in enumerate(self.members)]
-        return replace(
-            found[0],
-            predictive=pooled([p.predictive for p in found]),
-            recalibration=self.recalibrations.get(task),
-        )
 
 
 def fit_ensemble(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.prediction import Predictive
 from zoo.types import Batch, Posterior
 
-__all__ = ["Answer", "Exchange", "check_timing", "check_unseen", "fingerprints", "question"]
+__all__ = ["Answer", "Exchange", "check_unseen", "fingerprints", "question"]
 
 FAR = 0.1
 Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
@@ -134,7 +133,7 @@ class Exchange:
                 f"{self.assembly.entry.name}: goals beyond the demonstrations: "
                 f"{', '.join(told[:3])}{more}; the movement is an extrapolation",
                 ExtrapolationWarning,
-                stacklevel=4,
+                stacklevel=8,
             )
 
     def onto(self, onto: Sequences, count: int) -> Sequences:
@@ -172,24 +171,6 @@ class Exchange:
         )
 
 
-def check_timing(like: Sequences, duration: float, switches: bool, start: int, steps: int) -> None:
-    """Refuse a duration without frames, and a switch outside the new movement."""
-    if not 0 < duration < math.inf:
-        raise ValueError(f"duration must be positive and finite; got {duration}")
-    shortest = int(like.lengths.min())
-    frames = round((shortest - 1) * duration) + 1
-    if frames < 3:
-        raise ValueError(
-            f"duration={duration:g} leaves {frames} of {shortest} frames; at least 3 are needed"
-        )
-    if not switches and (start, steps) != (0, 1):
-        raise ValueError("start and steps are those of a switch: name the movements to go onto")
-    if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
-        raise ValueError(
-            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
-        )
-
-
 def _check_begin(assembly: Assembly, data: Sequences) -> None:
     """Warn where movements begin or end elsewhere than those trained on."""
     name, layout = assembly.entry.name, assembly.layout
@@ -200,7 +181,7 @@ def _check_begin(assembly: Assembly, data: Sequences) -> None:
             f"{name} was trained on windows of {layout.frames} frames and takes each movement of "
             f"up to {longest} frames for one of them: cut them by data.windows({layout.frames})",
             WindowsWarning,
-            stacklevel=5,
+            stacklevel=7,
         )
     if not layout.windows and begins - {0}:
         warnings.warn(
@@ -208,7 +189,7 @@ def _check_begin(assembly: Assembly, data: Sequences) -> None:
             f"the begin of one; these begin at frame {min(begins - {0})} and later: train it on "
             "windows too, or give movements from their first frame on",
             WindowsWarning,
-            stacklevel=5,
+            stacklevel=7,
         )
 
 

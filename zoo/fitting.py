@@ -12,9 +12,9 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.exchange import fingerprints
 from zoo.fingerprint import fingerprint
 from zoo.inference.train import Session
-from zoo.run import Run
+from zoo.run import Run, load
 from zoo.rundir import Resume, claimed
-from zoo.storage import load_run, save_run
+from zoo.storage import save_run
 from zoo.training import learn
 
 __all__ = ["fit"]
@@ -69,7 +69,7 @@ def fit(
 
 def _kept(assembly: Assembly, folder: Path, told: bool) -> Run:
     """The finished run of a folder as the training left it."""
-    run = Run(**vars(load_run(folder, device=assembly.device)))
+    run = load(folder, device=assembly.device)
     if told:
         done = f"{run.name}: trained before in {run.seconds:.0f} s, taken from {folder}"
         print(done, file=sys.stderr)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from zoo.datasets.records import Sequences
+from zoo.datasets.records import Groups, Pairs, Sequences
 from zoo.datasets.split import nearest
 from zoo.errors import NotCapableError, UnknownNameError
 
-__all__ = ["Setup", "hide_joints", "hide_section"]
+__all__ = ["NEEDS", "Question", "Setup", "ask", "beginning", "hide_joints", "hide_section"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +68,84 @@ class Setup:
                 f"the shortest movement has {shortest}"
             )
         return seen, horizon
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """What a model is given, and the truth that its answer is held against.
+
+    ``given`` holds nothing that is asked for; ``mask`` is True where the truth is known and asked
+    for; ``horizon`` belongs to forecasts.
+    """
+
+    task: str
+    given: Any
+    truth: Float[Tensor, "..."]
+    mask: Bool[Tensor, "..."]
+    groups: Groups
+    horizon: int = 0
+
+    @property
+    def need(self) -> str:
+        """The capability that an answer takes."""
+        return NEEDS[self.task]
+
+
+NEEDS = {
+    "regress": "regress",
+    "reconstruct": "reconstruct",
+    "forecast": "forecast",
+    "impute joints": "impute",
+    "impute section": "impute",
+}
+
+
+def ask(task: str, data: Pairs | Sequences, setup: Setup) -> Question:
+    """The question of that task about ``data``.
+
+    Raises UnknownNameError for a task that does not exist, TypeError for data of the other kind.
+
+    >>> import numpy as np
+    >>> data = Sequences.from_arrays(np.zeros((2, 30, 3)), rate=30.0)
+    >>> question = ask("forecast", data, Setup(seen=10, horizon=5))
+    >>> question.given.values.shape, question.truth.shape
+    (torch.Size([2, 10, 3]), torch.Size([2, 5, 3]))
+    """
+    if task not in NEEDS:
+        raise UnknownNameError(f"no task {task!r}; there are {', '.join(NEEDS)}")
+    kind = Pairs if task == "regress" else Sequences
+    if not isinstance(data, kind):
+        raise TypeError(f"{kind.__name__} are needed; got {type(data).__name__}")
+    if isinstance(data, Pairs):
+        return Question(
+            task=task, given=data, truth=data.targets, mask=data.mask, groups=data.groups
+        )
+    if task == "forecast":
+        return _forecast(data, *setup.frames(data))
+    if task == "reconstruct":
+        return _about(task, data, data, data.mask)
+    joints = task == "impute joints"
+    hidden, section = setup.hidden, setup.section
+    holed = hide_joints(data, hidden, seed=setup.seed) if joints else hide_section(data, section)
+    return _about(task, holed, data, data.mask & ~holed.mask)
+
+
+def _forecast(data: Sequences, seen: int, horizon: int) -> Question:
+    future = data.frames(seen, seen + horizon)
+    found = _about("forecast", beginning(data, seen, horizon), future, future.mask)
+    return replace(found, horizon=horizon)
+
+
+def _about(task: str, given: Sequences, truth: Sequences, mask: Tensor) -> Question:
+    return Question(task=task, given=given, truth=truth.values, mask=mask, groups=truth.groups)
+
+
+def beginning(data: Sequences, seen: int, horizon: int) -> Sequences:
+    """What a forecast may see: the first frames, and the controls of those to come as well."""
+    known = data.frames(0, seen)
+    if data.controls is None:
+        return known
+    return replace(known, controls=data.controls[:, : seen + horizon])
 
 
 def hide_joints(data: Sequences, hidden: float | tuple[str, ...], *, seed: int = 0) -> Sequences:

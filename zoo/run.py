@@ -3,37 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from numpy.typing import ArrayLike
 from torch import nn
 
+from zoo.answering import Answers, Query
 from zoo.assembly import create
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import NotCapableError
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
-from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
+from zoo.exchange import Answer, Exchange, check_unseen
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
+from zoo.lock import free
 from zoo.prediction import Prediction, Predictive
 from zoo.questions import Setup
 from zoo.record import Record
-from zoo.tasks import Method, Trained, corrections, posed
-from zoo.types import Batch, Posterior
+from zoo.storage import load_run, save_run
+from zoo.tasks import Trained, posed
+from zoo.types import Wishes
 
 __all__ = ["Run", "create", "evaluate", "load"]
 
 
 @dataclass(kw_only=True)
-class Run(Record):
-    """A trained model: predictions in the data's own units, calibration, saving.
-
-    What is kept of it is told by :class:`~zoo.record.Record`.
-    """
+class Run(Record, Answers):
+    """A trained model: predictions in the data's own units, calibration, saving."""
 
     def __repr__(self) -> str:
         """Model, data, tasks and calibration in one line."""
@@ -63,117 +61,31 @@ class Run(Record):
         """Tasks that the model can do."""
         return self.assembly.entry.capabilities
 
-    def forecast(
-        self, data: Sequences, *, horizon: int, draws: int = 200, seed: int = 0
-    ) -> Prediction:
-        """The ``horizon`` frames after the movements in ``data``, which hold the frames seen."""
-        if horizon < 1:
-            raise ValueError(f"horizon must be at least 1 frame; got {horizon}")
-        forecast = self._capability("forecast")
+    @property
+    def fingerprints(self) -> list[str]:
+        """Those of the movements or items that training saw."""
+        found: list[str] = self.trained_on["fingerprints"]
+        return found
 
-        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
-            return forecast(batch, posterior, horizon=horizon, draws=draws)
-
-        prediction = self._predict("forecast", data, answer, seed)
-        return replace(prediction, offset=int(data.lengths.max()), lengths=None)
-
-    def reconstruct(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """The movements as the model reproduces them."""
-        return self._simple("reconstruct", data, draws, seed)
-
-    def impute(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """All entries of the movements, those missing (NaN in the arrays) filled in."""
-        return self._simple("impute", data, draws, seed)
-
-    def represent(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """Latent trajectories of the movements."""
-        represent = self._capability("represent")
-
-        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
-            return represent(batch, posterior, draws=draws)
-
-        latent, frames = self.exchange.answer(data, answer, seed)
-        count = latent.location.shape[-1]
+    def uncorrected(self, query: Query) -> Prediction:
+        """The answer without the correction of its bands."""
+        if query.task == "regress":
+            return self._regressed(query)
+        latent = query.task == "represent"
+        found, frames = self.exchange.answer(query.data, self._method(query), query.seed)
+        layout, count = self.assembly.layout, found.location.shape[-1]
+        numbers = tuple(f"z_{i + 1}" for i in range(count))
+        ahead = query.task == "forecast"
         return Prediction(
-            predictive=latent,
-            axes=("sequence", "time", "latent"),
-            names=tuple(f"z_{i + 1}" for i in range(count)),
-            units=("",) * count,
-            task="represent",
-            rate=data.rate,
-            lengths=frames,
+            predictive=found if latent else self.exchange.unscaled(found, query.task),
+            axes=("sequence", "time", "latent" if latent else "channel"),
+            names=numbers if latent else layout.channels,
+            units=("",) * count if latent else layout.units,
+            task=query.task,
+            rate=query.data.rate if latent else layout.rate,
+            offset=int(query.data.lengths.max()) if ahead else 0,
+            lengths=None if ahead else frames,
         )
-
-    def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
-        """Targets of new inputs, given as Pairs or as an array (item, feature)."""
-        regress = self._capability("regress")
-        pairs = self.exchange.scaled(self.exchange.pairs(data))
-        with seeded(seed, self.assembly.device), torch.no_grad():
-            predictive = regress(pairs.inputs, draws=draws)
-        layout = self.assembly.layout
-        return Prediction(
-            predictive=self.exchange.unscaled(predictive, "regress"),
-            axes=("item", "target"),
-            names=layout.channels,
-            units=layout.units,
-            task="regress",
-            recalibration=self.recalibrations.get("regress"),
-        )
-
-    def generate(
-        self,
-        like: Sequences,
-        *,
-        goal: ArrayLike | None = None,
-        duration: float = 1.0,
-        onto: Sequences | None = None,
-        start: int = 0,
-        steps: int = 1,
-        draws: int = 200,
-        seed: int = 0,
-    ) -> Prediction:
-        """New movements after the demonstrations ``like``.
-
-        ``goal`` is the last frame to reach (of a rhythmic movement the centre to swing about), in
-        the data's units, one for all or one for each movement; ``duration`` stretches time;
-        ``onto`` are the movements to switch to, one for all or one for each, from frame ``start``
-        of the new movement over ``steps`` frames, (89).
-        """
-        generate = self._capability("generate")
-        check_timing(like, duration, onto is not None, start, steps)
-        target = None if goal is None else self.exchange.goal(goal, len(like))
-        other = None if onto is None else self.exchange.onto(onto, len(like))
-
-        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
-            return generate(
-                batch,
-                posterior,
-                goal=None if target is None else target[rows],
-                duration=duration,
-                onto=None if other is None else whole(other[rows]),
-                start=start,
-                steps=steps,
-                draws=draws,
-            )
-
-        return self._predict("generate", like, answer, seed)
-
-    def calibrate(
-        self,
-        data: Pairs | Sequences,
-        *,
-        method: Method = "conformal",
-        tasks: Sequence[str] | None = None,
-        setup: Setup | None = None,
-    ) -> Run:
-        """Fit and keep a correction of every spread on movements that training never saw.
-
-        ``setup`` says how the tasks will be posed, such as which channels will be missing.
-        """
-        check_unseen(data, self.trained_on["fingerprints"], "calibration")
-        self.recalibrations.update(corrections(self, data, method, tasks, setup))
-        self.calibrated_on = [*self.calibrated_on, *fingerprints(data)]
-        return self
 
     def report(self) -> dict[str, Any]:
         """What the model says of its learned parameters; empty where it says nothing.
@@ -188,41 +100,49 @@ class Run(Record):
         Another run there is replaced only with ``overwrite``, else RunExistsError is raised; the
         same training with a newer calibration always is.
         """
-        from zoo.lock import free
-        from zoo.storage import save_run
-
         with free(Path(folder)):
             return save_run(self, Path(folder), overwrite=overwrite)
 
-    def _capability(self, task: str) -> Callable[..., Predictive]:
-        if task not in self.capabilities:
-            raise NotCapableError(
-                f"{self.name} cannot {task}; it can {', '.join(self.capabilities)}"
+    def _method(self, query: Query) -> Answer:
+        """The model's method for the task, as it is asked about a batch."""
+        method: Callable[..., Predictive] = getattr(self.model, query.task)
+        draws = query.draws
+        if query.task == "forecast":
+            return lambda batch, posterior, rows: method(
+                batch, posterior, horizon=query.horizon, draws=draws
             )
-        method: Callable[..., Predictive] = getattr(self.model, task)
-        return method
+        if query.task == "generate":
+            wishes = self._wishes(query)
+            return lambda batch, posterior, rows: method(
+                batch, posterior, wishes=wishes(rows), draws=draws
+            )
+        return lambda batch, posterior, rows: method(batch, posterior, draws=draws)
 
-    def _simple(self, task: Any, data: Sequences, draws: int, seed: int) -> Prediction:
-        method = self._capability(task)
+    def _wishes(self, query: Query) -> Callable[[list[int]], Wishes]:
+        """The wishes for some of the movements, in the model's scale."""
+        count, onto = len(query.data), query.onto
+        goal = None if query.goal is None else self.exchange.goal(query.goal, count)
+        other = None if onto is None else self.exchange.onto(onto, count)
+        return lambda rows: Wishes(
+            goal=None if goal is None else goal[rows],
+            duration=query.duration,
+            onto=None if other is None else whole(other[rows]),
+            start=query.start,
+            steps=query.steps,
+        )
 
-        def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
-            return method(batch, posterior, draws=draws)
-
-        return self._predict(task, data, answer, seed)
-
-    def _predict(self, task: Any, data: Sequences, answer: Answer, seed: int) -> Prediction:
-        scaled, frames = self.exchange.answer(data, answer, seed)
-        predictive = self.exchange.unscaled(scaled, task)
+    def _regressed(self, query: Query) -> Prediction:
+        pairs = self.exchange.scaled(self.exchange.pairs(query.data))
+        with seeded(query.seed, self.assembly.device), torch.no_grad():
+            regress: Callable[..., Predictive] = getattr(self.model, query.task)
+            predictive = regress(pairs.inputs, draws=query.draws)
         layout = self.assembly.layout
         return Prediction(
-            predictive=predictive,
-            axes=("sequence", "time", "channel"),
+            predictive=self.exchange.unscaled(predictive, "regress"),
+            axes=("item", "target"),
             names=layout.channels,
             units=layout.units,
-            task=task,
-            rate=layout.rate,
-            lengths=frames,
-            recalibration=self.recalibrations.get(question(task, data)),
+            task="regress",
         )
 
 
@@ -244,8 +164,6 @@ def evaluate(
     return Table.of(run.name, data.name, scores, refused)
 
 
-def load(folder: str | Path) -> Run:
+def load(folder: str | Path, *, device: str = "cpu") -> Run:
     """A run that :meth:`Run.save` wrote; a damaged or foreign folder is refused with its reason."""
-    from zoo.storage import load_run
-
-    return Run(**vars(load_run(Path(folder))))
+    return Run(**vars(load_run(Path(folder), device=device)))

@@ -10,9 +10,8 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotCapableError, UnknownNameError
 from zoo.player import Player, play
-from zoo.questions import Setup
+from zoo.questions import Setup, beginning
 from zoo.run import Run
-from zoo.tasks import beginning
 from zoo.workflow import open_run
 
 __all__ = ["screen", "screen_run"]

@@ -1,11 +1,11 @@
-"""Questions that a trained model is asked, each with the truth that its answer is held against."""
+"""Answers of a trained model to questions, beside the truth that they are held against."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, TypeVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
 
 from torch import Tensor
 
@@ -17,22 +17,20 @@ from zoo.errors import (
 )
 from zoo.evaluation.calibration import recalibrate
 from zoo.prediction import Prediction, Recalibration
-from zoo.questions import Setup, hide_joints, hide_section
+from zoo.questions import NEEDS, Question, Setup, ask
 
 __all__ = [
-    "TASKS",
     "Method",
     "Predictor",
     "Trained",
     "Trial",
-    "beginning",
+    "answered",
     "corrections",
     "posed",
     "trials",
 ]
 
 Method = Literal["conformal", "isotonic", "scale"]
-_Record = TypeVar("_Record", Pairs, Sequences)
 
 
 class Predictor(Protocol):
@@ -90,54 +88,16 @@ class Trial:
     groups: Groups
 
 
-def _regress(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
-    pairs = _expect(data, Pairs)
-    prediction = run.regress(pairs, draws=setup.draws, seed=setup.seed)
-    return Trial(
-        task="regress",
-        prediction=prediction,
-        truth=pairs.targets,
-        mask=pairs.mask,
-        groups=pairs.groups,
-    )
-
-
-def _reconstruct(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
-    movements = _expect(data, Sequences)
-    prediction = run.reconstruct(movements, draws=setup.draws, seed=setup.seed)
-    return _trial("reconstruct", prediction, movements, movements.mask)
-
-
-def _forecast(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
-    movements = _expect(data, Sequences)
-    seen, horizon = setup.frames(movements)
-    known = beginning(movements, seen, horizon)
-    prediction = run.forecast(known, horizon=horizon, draws=setup.draws, seed=setup.seed)
-    future = movements.frames(seen, seen + horizon)
-    return _trial("forecast", prediction, future, future.mask)
-
-
-def _impute_joints(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
-    movements = _expect(data, Sequences)
-    holed = hide_joints(movements, setup.hidden, seed=setup.seed)
-    prediction = run.impute(holed, draws=setup.draws, seed=setup.seed)
-    return _trial("impute joints", prediction, movements, movements.mask & ~holed.mask)
-
-
-def _impute_section(run: Predictor, data: Pairs | Sequences, setup: Setup) -> Trial:
-    movements = _expect(data, Sequences)
-    holed = hide_section(movements, setup.section)
-    prediction = run.impute(holed, draws=setup.draws, seed=setup.seed)
-    return _trial("impute section", prediction, movements, movements.mask & ~holed.mask)
-
-
-TASKS: dict[str, tuple[str, Callable[[Predictor, Pairs | Sequences, Setup], Trial]]] = {
-    "regress": ("regress", _regress),
-    "reconstruct": ("reconstruct", _reconstruct),
-    "forecast": ("forecast", _forecast),
-    "impute joints": ("impute", _impute_joints),
-    "impute section": ("impute", _impute_section),
-}
+def answered(run: Predictor, question: Question, *, draws: int, seed: int) -> Prediction:
+    """What a run says to a question; it gets nothing of the truth but what is ``given``."""
+    given = question.given
+    if question.need == "regress":
+        return run.regress(given, draws=draws, seed=seed)
+    if question.need == "reconstruct":
+        return run.reconstruct(given, draws=draws, seed=seed)
+    if question.need == "forecast":
+        return run.forecast(given, horizon=question.horizon, draws=draws, seed=seed)
+    return run.impute(given, draws=draws, seed=seed)
 
 
 def trials(
@@ -165,9 +125,10 @@ def posed(
     """
     found: list[Trial] = []
     refused: dict[str, UnanswerableError] = {}
+    how = setup or Setup()
     for name in _names(run, tasks):
         try:
-            found.append(TASKS[name][1](run, data, setup or Setup()))
+            found.append(_trial(run, ask(name, data, how), how))
         except UnanswerableError as error:
             refused[name] = error
     if refused and not found:
@@ -177,7 +138,7 @@ def posed(
 
 def _names(run: Predictor, tasks: Sequence[str] | None) -> list[str]:
     """Tasks to pose; those that the model has not are named."""
-    names = [t for t, (need, _) in TASKS.items() if need in run.capabilities]
+    names = [task for task, need in NEEDS.items() if need in run.capabilities]
     if tasks is not None:
         unknown = [t for t in tasks if t not in names]
         if unknown:
@@ -210,21 +171,11 @@ def corrections(
     }
 
 
-def beginning(data: Sequences, seen: int, horizon: int) -> Sequences:
-    """What a forecast may see: the first frames, and the controls of those to come as well."""
-    known = data.frames(0, seen)
-    if data.controls is None:
-        return known
-    return replace(known, controls=data.controls[:, : seen + horizon])
-
-
-def _trial(task: str, prediction: Prediction, truth: Sequences, mask: Tensor) -> Trial:
+def _trial(run: Predictor, question: Question, setup: Setup) -> Trial:
     return Trial(
-        task=task, prediction=prediction, truth=truth.values, mask=mask, groups=truth.groups
+        task=question.task,
+        prediction=answered(run, question, draws=setup.draws, seed=setup.seed),
+        truth=question.truth,
+        mask=question.mask,
+        groups=question.groups,
     )
-
-
-def _expect(data: Pairs | Sequences, kind: type[_Record]) -> _Record:
-    if not isinstance(data, kind):
-        raise TypeError(f"{kind.__name__} are needed; got {type(data).__name__}")
-    return data

@@ -152,6 +152,21 @@ class Batch:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Wishes:
+    """How new movements are to differ from their demonstrations, in the model's scale.
+
+    ``goal`` is the last frame to reach, ``duration`` stretches time, ``onto`` are the movements to
+    switch to, from frame ``start`` of the new movement over ``steps`` frames, (89).
+    """
+
+    goal: Float[Tensor, "sequence channel"] | None = None
+    duration: float = 1.0
+    onto: Batch | None = None
+    start: int = 0
+    steps: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
 class Sites:
     """The latent sites of an exact posterior, in the order in which they are drawn.
 

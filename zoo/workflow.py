@@ -21,9 +21,9 @@ from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.answers import clusters
 from zoo.fitting import fit
 from zoo.prediction import Prediction
-from zoo.questions import Setup
+from zoo.questions import Setup, beginning
 from zoo.run import Run, load
-from zoo.tasks import beginning, trials
+from zoo.tasks import trials
 
 __all__ = ["ForecastReport", "Plan", "forecast_report", "open_run", "reliability_figure", "train"]
 

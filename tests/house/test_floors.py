@@ -39,6 +39,7 @@ FLOORS = {
     "zoo.rundir": 4,
     "zoo.training": 4,
     "zoo.record": 4,
+    "zoo.answering": 4,
     "zoo.run": 4,
     "zoo.ensemble": 4,
     "zoo.storage": 4,

@@ -320,8 +320,7 @@ def test_bands_cover_data_drawn_from_the_model():
 
 
 def generate(model, batch, **changes):
-    settings = {"goal": None, "duration": 1.0, "onto": None, "start": 0, "steps": 1, "draws": 1}
-    return model.generate(batch, None, **{**settings, **changes})
+    return model.generate(batch, None, wishes=Wishes(**changes), draws=1)
 
 
 def test_twice_the_way_to_the_goal_doubles_the_movement():

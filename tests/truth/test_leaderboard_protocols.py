@@ -56,7 +56,7 @@ def test_the_default_protocol_sees_nothing_of_what_is_judged(model: str, tmp_pat
     data = movements()
     asked = own_protocol(data, seen=SEEN, horizon=12)
     other = spoiled(data, asked.folds(data, 4)[0].judged, asked)
-    assert not torch.equal(asked.truth(data)[0], asked.truth(other)[0])
+    assert not torch.equal(asked.question(data).truth, asked.question(other).truth)
     kept = [answer(asked, d, model, tmp_path / str(i)) for i, d in enumerate((data, other))]
     assert same(*kept)
 

@@ -18,6 +18,7 @@ from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.models.promp import Config, ProMP
+from zoo.types import Wishes
 
 FRAMES, CHANNELS, KERNELS = 30, 3, 5
 
@@ -220,9 +221,7 @@ def test_rhythmic_movements_swing_about_their_goal_and_keep_their_phase():
     error = (answer.location.mean(0) - data.values[:, 25:]).square().mean().sqrt()
     assert float(error) < 0.2
     goal = torch.tensor([[2.0, -1.0]], dtype=torch.float64)
-    new = model.generate(
-        whole(data[:1]), None, goal=goal, duration=1.0, onto=None, start=0, steps=1, draws=2
-    )
+    new = model.generate(whole(data[:1]), None, wishes=Wishes(goal=goal), draws=2)
     torch.testing.assert_close(new.location[0, 0].mean(0), goal[0], rtol=0, atol=0.05)
 
 

@@ -25,6 +25,7 @@ from zoo.inference.posterior import seeded
 from zoo.mixtures import cdf
 from zoo.models import promp
 from zoo.models.promp import Config, ProMP
+from zoo.types import Wishes
 
 FRAMES, CHANNELS, KERNELS = 14, 2, 4
 SIZE = KERNELS * CHANNELS
@@ -241,9 +242,7 @@ def reaches(count: int, seed: int, goals: int = 0) -> Sequences:
 
 def generated(model: ProMP, like: Sequences, goal: torch.Tensor):
     """Path and standard deviation of demonstrations that are to end elsewhere."""
-    answer = model.generate(
-        whole(like), None, goal=goal, duration=1.0, onto=None, start=0, steps=1, draws=2
-    )
+    answer = model.generate(whole(like), None, wishes=Wishes(goal=goal), draws=2)
     return answer.location[0], (answer.epistemic.square() + answer.noise.square()).sqrt()[0]
 
 

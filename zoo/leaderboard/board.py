@@ -120,7 +120,7 @@ def _board(
         raise ValueError(f"no model could answer {asked.name}: {'; '.join(failed.values())}")
     order = sorted(table, key=lambda m: float(table[m].scores["mse"].mean()))
     seconds = {m: sum(f.seconds for f in found if f.cell.model == m) for m in order}
-    _, mask = asked.truth(data)
+    mask = asked.question(data).mask
     channels = tuple(np.asarray(data.channels)[mask.any(0).any(0).numpy()].tolist())
     return (
         Board(
@@ -137,12 +137,12 @@ def _board(
 
 
 def _judged(asked: Protocol, data: Sequences, found: Sequence[Found]) -> Judged:
-    truth, mask = asked.truth(data)
+    question = asked.question(data)
     seeds = []
     for seed in dict.fromkeys(f.cell.seed for f in found):
         mine = [f for f in found if f.cell.seed == seed]
         parts = [(f.cell.fold, f.prediction) for f in mine if f.prediction is not None]
-        seeds.append(judged(parts, truth, mask, data.groups[asked.by]))
+        seeds.append(judged(parts, question.truth, question.mask, data.groups[asked.by]))
     return Judged.mean(seeds)
 
 

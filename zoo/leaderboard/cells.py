@@ -26,6 +26,7 @@ from zoo.fitting import fit
 from zoo.leaderboard.protocol import Fold, Protocol
 from zoo.prediction import Prediction, Predictive
 from zoo.run import create
+from zoo.tasks import answered
 
 __all__ = ["FAILURES", "Cell", "Found", "compute", "compute_all"]
 
@@ -175,7 +176,9 @@ def _answered(
     run = members[0] if len(members) == 1 else Ensemble(members=tuple(members))
     found = Found(
         cell=cell,
-        prediction=asked.answer(run, data[list(cell.rows)], draws=DRAWS, seed=cell.seed),
+        prediction=answered(
+            run, asked.question(data[list(cell.rows)]), draws=DRAWS, seed=cell.seed
+        ),
         error="",
         seconds=sum(member.seconds for member in members),
         reused="training" if before else "",

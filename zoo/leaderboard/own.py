@@ -12,6 +12,7 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.leaderboard.protocol import Protocol
 from zoo.leaderboard.protocols import FORECASTERS, IMPUTERS, protocol
+from zoo.questions import hide_joints
 
 __all__ = ["asked_for", "own_protocol"]
 
@@ -25,7 +26,7 @@ def own_protocol(
     by: str = "trial",
     settings: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Protocol:
-    """Forecast ``horizon`` frames after ``seen``, or impute channels that begin with ``hidden``.
+    """Forecast ``horizon`` frames after ``seen``, or impute the channels or joints ``hidden``.
 
     ``by`` is the group column whose values stay together in a fold; ``settings`` are those of
     entries by name. A ``ValueError`` says what the data cannot be asked.
@@ -92,13 +93,10 @@ def _forecast(data: Sequences, seen: int, horizon: int) -> dict[str, Any]:
 
 
 def _imputation(data: Sequences, hidden: Sequence[str]) -> dict[str, Any]:
-    inside = [c for c in data.channels if c.startswith(tuple(hidden))]
-    missed = [h for h in hidden if not any(c.startswith(h) for c in data.channels)]
-    if missed or len(inside) == len(data.channels):
-        raise ValueError(
-            f"hidden must begin some of the {len(data.channels)} channels of {data.name!r} "
-            f"({', '.join(data.channels[:4])}, …) and not all; got {', '.join(hidden)}"
-        )
+    left = hide_joints(data, tuple(hidden)).mask.flatten(0, 1).any(0).tolist()
+    recorded = data.mask.flatten(0, 1).any(0).tolist()
+    pairs = zip(data.channels, recorded, left, strict=True)
+    inside = [c for c, known, kept in pairs if known and not kept]
     return {
         "name": f"{_slug(data.name)}-without-{_slug('-'.join(hidden))}",
         "summary": f"{data.name}: {len(inside)} channels imputed, {', '.join(inside)}",

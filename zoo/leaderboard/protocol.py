@@ -7,12 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from zoo.datasets.records import Sequences
 from zoo.errors import UnknownNameError
-from zoo.prediction import Prediction
-from zoo.tasks import Predictor, beginning
+from zoo.questions import Question, Setup, ask
 
 __all__ = ["Fold", "Protocol", "Published", "check_models"]
 
@@ -87,21 +85,11 @@ class Protocol:
         means = (data.values * data.mask).sum(1, keepdim=True) / data.mask.sum(1, keepdim=True)
         return replace(data, values=torch.where(data.mask, data.values - means, 0.0))
 
-    def answer(self, run: Predictor, data: Sequences, *, draws: int, seed: int) -> Prediction:
-        """The prediction of a run for movements whose truth is ``data``."""
+    def question(self, data: Sequences) -> Question:
+        """What models are given of ``data``, and what of it is asked for."""
         if self.need == "forecast":
-            known = beginning(data, self.seen, self.horizon)
-            return run.forecast(known, horizon=self.horizon, draws=draws, seed=seed)
-        mask = data.mask & ~self._hidden(data)
-        known = replace(data, mask=mask, values=torch.where(mask, data.values, 0.0))
-        return run.impute(known, draws=draws, seed=seed)
-
-    def truth(self, data: Sequences) -> tuple[Tensor, Tensor]:
-        """The recorded values, and which of their entries were asked for."""
-        if self.need == "forecast":
-            future = data.frames(self.seen, self.seen + self.horizon)
-            return future.values, future.mask
-        return data.values, data.mask & self._hidden(data)
+            return ask("forecast", data, Setup(seen=self.seen, horizon=self.horizon))
+        return ask("impute joints", data, Setup(hidden=self.hidden))
 
     def folds(self, data: Sequences, count: int) -> list[Fold]:
         """Fold k is judged, fold k + 1 calibrates, the rest trains; groups stay together."""
@@ -116,9 +104,6 @@ class Protocol:
         for row, group in enumerate(data.groups[self.by]):
             each[home[group]].append(row)
         return [_fold(each, k) for k in range(count)]
-
-    def _hidden(self, data: Sequences) -> Tensor:
-        return torch.tensor([c.startswith(self.hidden) for c in data.channels])
 
 
 def _fold(each: Sequence[Sequence[int]], k: int) -> Fold:

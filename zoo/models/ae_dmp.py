@@ -21,7 +21,7 @@ from zoo.models.latent_dmp import check_end, check_whole, common_length, need
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp, widths
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior
+from zoo.types import Batch, Layout, Posterior, Wishes
 
 __all__ = ["AeDmp", "Config"]
 
@@ -203,23 +203,20 @@ class AeDmp(nn.Module):
         batch: Batch,
         posterior: Posterior | None,
         *,
-        goal: Float[Tensor, "sequence channel"] | None,
-        duration: float,
-        onto: Batch | None,
-        start: int,
-        steps: int,
+        wishes: Wishes,
         draws: int,
     ) -> Predictive:
         """Goal changes (§5.3.6, in latent space), other durations, and switching (89)."""
+        duration = wishes.duration
         θ, length = self._imitated(batch, posterior), round((self.frames - 1) * duration) + 1
-        if goal is not None:
-            θ = self.imitator.aimed(θ, need(posterior).encode(goal).mean)
-        if onto is None:
+        if wishes.goal is not None:
+            θ = self.imitator.aimed(θ, need(posterior).encode(wishes.goal).mean)
+        if wishes.onto is None:
             return self._decoded((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
-        η = ramp(length, start, steps)
+        η = ramp(length, wishes.start, wishes.steps)
         here = self.imitator.design(length, duration=duration, weight=1 - η)
         there = self.imitator.design(length, duration=duration, weight=η, begin=False)
-        path = here.to(θ) @ θ + there.to(θ) @ self._imitated(onto, posterior)
+        path = here.to(θ) @ θ + there.to(θ) @ self._imitated(wishes.onto, posterior)
         return self._decoded(path[None])
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:

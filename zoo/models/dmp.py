@@ -26,7 +26,7 @@ from zoo.dynamics.rollout import Timing, roll_out
 from zoo.models.baseline import seen_entries, seen_movements
 from zoo.models.learned_dmp import COMPONENTS, Config, LearnedDmp
 from zoo.prediction import Predictive
-from zoo.types import Batch, Posterior, Sites
+from zoo.types import Batch, Posterior, Sites, Wishes
 
 __all__ = ["DMP", "Config"]
 
@@ -157,11 +157,7 @@ class DMP(LearnedDmp):
         batch: Batch,
         posterior: Posterior | None,
         *,
-        goal: Float[Tensor, "sequence channel"] | None,
-        duration: float,
-        onto: Batch | None,
-        start: int,
-        steps: int,
+        wishes: Wishes,
         draws: int,
     ) -> Predictive:
         """Roll-outs of the demonstrated weights, with other goals, durations, or switched (89).
@@ -172,9 +168,11 @@ class DMP(LearnedDmp):
         g' − g.
         """
         self._check_fitted()
+        goal, duration, onto = wishes.goal, wishes.duration, wishes.onto
         frames = round((batch.values.shape[1] - 1) * duration) + 1
         other = None if onto is None else self._demonstrated(onto, len(batch))
-        blend = ramp(frames, start, steps) if other else torch.zeros(frames - 1, dtype=self.dtype)
+        still = torch.zeros(frames - 1, dtype=self.dtype)
+        blend = ramp(frames, wishes.start, wishes.steps) if other else still
         rolled = self._roll_outs
 
         def mix(i: int, case: Case) -> Paths:
@@ -186,7 +184,7 @@ class DMP(LearnedDmp):
             if goal is not None:
                 moved, rest = self._moved(other[i] if other else case, goal[i])
                 terms[-1] = (terms[-1][0], moved)
-                terms.append((minimum_jerk(frames, start)[:, None], Population.fixed(rest)))
+                terms.append((minimum_jerk(frames, wishes.start)[:, None], Population.fixed(rest)))
             return rolled.summed(terms, timing)
 
         parts = [mix(i, case) for i, case in enumerate(self._demonstrated(batch, len(batch)))]

@@ -26,7 +26,7 @@ from zoo.models import dmp, pca
 from zoo.models.baseline import seen_entries, seen_movements
 from zoo.models.learned_dmp import COMPONENTS
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior, Sites
+from zoo.types import Batch, Layout, Posterior, Sites, Wishes
 
 __all__ = ["Config", "PcaDmp"]
 
@@ -181,24 +181,17 @@ class PcaDmp(nn.Module):
         batch: Batch,
         posterior: Posterior | None,
         *,
-        goal: Float[Tensor, "sequence channel"] | None,
-        duration: float,
-        onto: Batch | None,
-        start: int,
-        steps: int,
+        wishes: Wishes,
         draws: int,
     ) -> Predictive:
         """Other goals, durations and switching in the components; the nearest goal they have."""
-        made = self.dmp.generate(
-            self._latent(batch),
-            None,
+        goal, onto = wishes.goal, wishes.onto
+        latent = replace(
+            wishes,
             goal=None if goal is None else self._components(goal[:, None], None)[0][:, 0],
-            duration=duration,
             onto=None if onto is None else self._latent(onto),
-            start=start,
-            steps=steps,
-            draws=draws,
         )
+        made = self.dmp.generate(self._latent(batch), None, wishes=latent, draws=draws)
         return self._changed(made)
 
     @property

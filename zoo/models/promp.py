@@ -32,7 +32,7 @@ from zoo.models.baseline import (
     seen_movements,
 )
 from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior, Sites
+from zoo.types import Batch, Layout, Posterior, Sites, Wishes
 
 __all__ = ["Config", "ProMP"]
 
@@ -225,11 +225,7 @@ class ProMP(nn.Module):
         batch: Batch,
         posterior: Posterior | None,
         *,
-        goal: Float[Tensor, "sequence channel"] | None,
-        duration: float,
-        onto: Batch | None,
-        start: int,
-        steps: int,
+        wishes: Wishes,
         draws: int,
     ) -> Predictive:
         """Paths of the demonstrated weights, with other goals, durations, or switched (89).
@@ -237,11 +233,12 @@ class ProMP(nn.Module):
         A switched movement keeps the tempo of ``batch``; ``goal`` is then that of ``onto``.
         """
         check_fitted("promp", self.mean)
+        goal, duration, onto = wishes.goal, wishes.duration, wishes.onto
         frames = round((batch.values.shape[1] - 1) * duration) + 1
         demonstrated = self._demonstrated(batch, len(batch))
         other = None if onto is None else self._demonstrated(onto, len(batch))
         still = torch.zeros(frames, dtype=self.dtype)
-        blend = still if other is None else ramp(frames + 1, start, steps)
+        blend = still if other is None else ramp(frames + 1, wishes.start, wishes.steps)
 
         def mix(i: int) -> Paths:
             timing = Timing(demonstrated[i][0].unit * duration, demonstrated[i][0].offset)

@@ -17,7 +17,7 @@ from zoo.inference.laplace import laplace
 from zoo.models.latent_dmp import Config, check_whole, need
 from zoo.models.latent_path_prior import PRIOR_DRAWS, LatentPathPrior, observed
 from zoo.prediction import Predictive
-from zoo.types import Batch, Posterior
+from zoo.types import Batch, Posterior, Wishes
 
 __all__ = ["Config", "VaeDmp"]
 
@@ -110,24 +110,20 @@ class VaeDmp(LatentPathPrior):
         batch: Batch,
         posterior: Posterior | None,
         *,
-        goal: Float[Tensor, "sequence channel"] | None,
-        duration: float,
-        onto: Batch | None,
-        start: int,
-        steps: int,
+        wishes: Wishes,
         draws: int,
     ) -> Predictive:
         """Goal changes (§6.2.5), other durations and switching (89), with noise from its prior."""
-        guide = need(posterior)
+        guide, goal, duration = need(posterior), wishes.goal, wishes.duration
         here = self._latents(guide.draw(batch, draws))
         if goal is not None:
             here = self._aimed(here, self._goal(goal, guide, draws))
         pull, position, velocity = self._pull(here, duration), here.position, here.velocity
         if goal is not None and self.phased:
             pull = self._ended(here, pull, duration)
-        if onto is not None:
-            there = self._pull(self._latents(guide.draw(onto, draws)), duration)
-            η = ramp(pull.shape[-2] + 1, start, steps)[:, None]
+        if wishes.onto is not None:
+            there = self._pull(self._latents(guide.draw(wishes.onto, draws)), duration)
+            η = ramp(pull.shape[-2] + 1, wishes.start, wishes.steps)[:, None]
             pull = torch.lerp(pull, there, η.to(pull))
         noise = torch.randn_like(pull) @ self.w_noise
         system = replace(self.system, tau=duration)
