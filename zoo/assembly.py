@@ -186,7 +186,7 @@ def _part(entry: Entry, part: Part, *needed: str) -> Any:
         if not hasattr(kind, name):
             raise TypeError(
                 f"{entry.name}: {kind.__name__} needs a class attribute {name} "
-                "(see zoo.capabilities.GenerativeModel and Guide)"
+                "(see zoo.parts.GenerativeModel and Guide)"
             )
     if not dataclasses.is_dataclass(kind.config_class):
         raise TypeError(

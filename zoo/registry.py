@@ -38,7 +38,8 @@ class Entry:
     set that ``zoo fit`` takes where none is named; ``scaling`` how the run scales data;
     ``config`` overrides defaults of the model's and the guide's ``Config``.
 
-    What the classes must have is written in :mod:`zoo.capabilities`; see ``docs/skeleton``.
+    What the classes must have is written in :mod:`zoo.parts` and :mod:`zoo.capabilities`; an
+    entry of each inference is in ``docs/skeleton``.
 
     >>> class Mine:
     ...     def forecast(self, batch, posterior, *, horizon, draws): ...

@@ -20,7 +20,7 @@ from zoo.catalogue import CATALOGUE
 from zoo.datasets.scaling import Scaler
 from zoo.errors import DamagedRunError, NotRegisteredError, RunExistsError, UnknownNameError
 from zoo.evaluation.calibration import recalibration_from_state
-from zoo.inference.train import Builds
+from zoo.parts import Builds
 from zoo.registry import Entry, named_well
 from zoo.run import Run
 from zoo.types import Layout

@@ -14,6 +14,7 @@ FLOORS = {
     "zoo.prediction": 0,
     "zoo.mixtures": 0,
     "zoo.capabilities": 0,
+    "zoo.parts": 0,
     "zoo.strategies": 0,
     "zoo.registry": 0,
     "zoo.methods": 0,

@@ -168,7 +168,7 @@ def test_a_run_of_an_entry_that_nobody_registered_is_told_of(
     parts: tuple[Meta, Tensors], tmp_path: Path
 ) -> None:
     meta, tensors = parts
-    with pytest.raises(NotRegisteredError, match="'no-such-model'.* is not registered here"):
+    with pytest.raises(NotRegisteredError, match=r"'no-such-model'.* is not registered here"):
         zoo.load(forged(tmp_path / "run", {**meta, "entry": "no-such-model"}, tensors))
 
 
