@@ -7,6 +7,7 @@ All tensors are in the model's own scale and dtype; the run scales on the way in
 ``posterior`` is the guide behind the :class:`~zoo.types.Posterior` protocol, or None for
 baselines, which have no guide. A batch given for prediction holds whole movements of one length,
 starting at frame 0 (``batch.start == 0``); what a forecast has seen is exactly ``batch.values``.
+``draws`` is how many joint draws to make; 0 asks for the moments alone.
 """
 
 from __future__ import annotations

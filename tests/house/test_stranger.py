@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import copy
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +30,7 @@ from torch import Tensor
 import zoo
 from zoo.catalogue import CATALOGUE
 
+ROOT = Path(__file__).resolve().parents[2]
 TASKS = ("forecast", "impute joints", "impute section")
 
 
@@ -114,3 +119,19 @@ def test_a_flipped_posterior_mean_is_not_calibrated(run: zoo.Run, task: str) -> 
 def test_a_flipped_posterior_mean_moves_the_bound(run: zoo.Run) -> None:
     with pytest.raises(AssertionError, match="the bound moves"):
         check_exact(flipped(run))
+
+
+def test_the_contract_takes_it_where_its_package_is_installed(tmp_path: Path) -> None:
+    """An entry point is all that it needs: the contract tests ask it what they ask every entry."""
+    info = tmp_path / "gpfa-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: gpfa\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[movezoo.models]\ngpfa = stranger.entry:ENTRY\n")
+    path = [tmp_path, ROOT / "tests", *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    asked = [*command, "-k", "gpfa", "tests/contract", "tests/faces/test_cards.py"]
+    done = subprocess.run(asked, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    passed = re.search(r"(\d+) passed", done.stdout)
+    assert passed is not None and int(passed[1]) >= 40, done.stdout

@@ -41,7 +41,8 @@ class Config:
 class GPFA(nn.Module):
     """Smooth latent trajectories, each a Gaussian process over time, seen through a linear map.
 
-        z_k ~ GP(0, (1 − ε) exp(−(t − t')²/2τ_k²) + ε δ_tt'),  x_t ~ N(C z_t + d, diag σ²)
+        z_k ~ GP(0, (1 − ε) exp(−(t − t')²/2τ_k²) + ε δ_tt')
+        x_t ~ N(C z_t + d, diag σ²)
 
     Yu et al., *Gaussian-process factor analysis for low-dimensional single-trial analysis of neural
     population activity*, J. Neurophysiology 102 (2009). Time t is counted in frames. Evidence,

@@ -184,3 +184,7 @@ def test_seconds_count_from_the_start_of_the_movement() -> None:
     later = replace(mixture(), offset=3)
     assert later.seconds is not None
     np.testing.assert_allclose(later.seconds.numpy(), [0.1, 4 / 30, 5 / 30, 0.2])
+
+
+def test_no_draws_are_none() -> None:
+    assert Predictive(location=torch.zeros(1, 2, 3), draws=torch.zeros(0, 2, 3)).draws is None
