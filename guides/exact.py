@@ -4,23 +4,16 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import pyro
 import torch
 from torch import Tensor, nn
 
+from zoo.parts import KnowsPosterior
 from zoo.types import Batch, Layout, Sites
 
-__all__ = ["Config", "ExactPosterior", "KnowsPosterior"]
-
-
-class KnowsPosterior(Protocol):
-    """A model with closed-form inference."""
-
-    def posterior_sites(self, batch: Batch) -> Sites:
-        """p(latent sites | data): one distribution after the other, and their plate."""
-        ...
+__all__ = ["Config", "ExactPosterior"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from zoo.version import __version__
 
 if TYPE_CHECKING:
     from zoo.cards import card
-    from zoo.catalogue import list_models
+    from zoo.catalogue import list_models, register
     from zoo.datasets.joined import concatenate
     from zoo.datasets.library import list_data, load_data
     from zoo.datasets.records import Pairs, Sequences
@@ -20,17 +20,29 @@ if TYPE_CHECKING:
     from zoo.evaluation.table import Table
     from zoo.fitting import fit
     from zoo.player import play
-    from zoo.prediction import Prediction
+    from zoo.prediction import Prediction, Predictive
     from zoo.questions import Setup
+    from zoo.registry import Entry
     from zoo.run import Run, create, evaluate, load
+    from zoo.strategies import Exact, MarginalLikelihood, Svi
+    from zoo.types import Batch, Layout, Posterior, Sites
 
 __all__ = [
+    "Batch",
     "Ensemble",
+    "Entry",
+    "Exact",
+    "Layout",
+    "MarginalLikelihood",
     "Pairs",
+    "Posterior",
     "Prediction",
+    "Predictive",
     "Run",
     "Sequences",
     "Setup",
+    "Sites",
+    "Svi",
     "Table",
     "__version__",
     "card",
@@ -44,15 +56,25 @@ __all__ = [
     "load",
     "load_data",
     "play",
+    "register",
 ]
 
 _HOME = {
+    "Batch": "zoo.types",
     "Ensemble": "zoo.ensemble",
+    "Entry": "zoo.registry",
+    "Exact": "zoo.strategies",
+    "Layout": "zoo.types",
+    "MarginalLikelihood": "zoo.strategies",
     "Pairs": "zoo.datasets.records",
+    "Posterior": "zoo.types",
     "Prediction": "zoo.prediction",
+    "Predictive": "zoo.prediction",
     "Run": "zoo.run",
     "Sequences": "zoo.datasets.records",
     "Setup": "zoo.questions",
+    "Sites": "zoo.types",
+    "Svi": "zoo.strategies",
     "Table": "zoo.evaluation.table",
     "card": "zoo.cards",
     "concatenate": "zoo.datasets.joined",
@@ -65,6 +87,7 @@ _HOME = {
     "load": "zoo.run",
     "load_data": "zoo.datasets.library",
     "play": "zoo.player",
+    "register": "zoo.catalogue",
 }
 
 

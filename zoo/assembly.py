@@ -20,7 +20,7 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import UnknownNameError
 from zoo.inference.elbo import Program
 from zoo.inference.posterior import seeded
-from zoo.registry import Entry, Scaling, load
+from zoo.registry import Entry, Part, Scaling, load
 from zoo.strategies import Inference, Svi
 from zoo.types import Batch, Layout
 
@@ -138,8 +138,8 @@ def assemble(
                 f"{entry.name} has no setting {key!r}; nearest: {', '.join(near)}"
             )
     values = {**entry.config, **settings}
-    model_class = load(entry.model)
-    guide_class = None if entry.guide is None else load(entry.guide)
+    model_class = _part(entry, entry.model, "config_class", "dtype")
+    guide_class = None if entry.guide is None else _part(entry, entry.guide, "config_class")
     with seeded(seed):
         model = model_class(layout, _config(entry, model_class.config_class, values))
         guide = None
@@ -165,8 +165,9 @@ def options(entry: Entry) -> dict[str, tuple[str, Any, Any]]:
     found: dict[str, tuple[str, Any, Any]] = {}
     for part, path in (("guide", entry.guide), ("model", entry.model)):
         if path is not None:
-            kinds = get_type_hints(load(path).config_class)
-            for field in dataclasses.fields(load(path).config_class):
+            config_class = _part(entry, path, "config_class").config_class
+            kinds = get_type_hints(config_class)
+            for field in dataclasses.fields(config_class):
                 default = entry.config.get(field.name, field.default)
                 found[field.name] = (part, kinds[field.name], default)
     kinds = get_type_hints(type(entry.inference))
@@ -176,6 +177,23 @@ def options(entry: Entry) -> dict[str, tuple[str, Any, Any]]:
         found["guide"] = ("guide", automatic.Name, None)
     found["scaling"] = ("data", Scaling, entry.scaling)
     return found
+
+
+def _part(entry: Entry, part: Part, *needed: str) -> Any:
+    """The class of a model or guide, with the class attributes that it cannot do without."""
+    kind = load(part)
+    for name in needed:
+        if not hasattr(kind, name):
+            raise TypeError(
+                f"{entry.name}: {kind.__name__} needs a class attribute {name} "
+                "(see zoo.parts.GenerativeModel and Guide)"
+            )
+    if not dataclasses.is_dataclass(kind.config_class):
+        raise TypeError(
+            f"{entry.name}: config_class of {kind.__name__} must be a dataclass with the settings; "
+            f"got {kind.config_class!r}"
+        )
+    return kind
 
 
 def _scaling(kind: Any) -> Scaling:

@@ -1,9 +1,13 @@
 """What a model can do: protocols that ``can=`` and the evaluation derive their answers from.
 
+A capability is a method of that name in the model's class: :class:`~zoo.registry.Entry` finds it,
+and nothing else is declared. What every model has besides is in :mod:`zoo.parts`.
+
 All tensors are in the model's own scale and dtype; the run scales on the way in and out.
-``posterior`` is the guide behind the :class:`~zoo.types.Posterior` protocol, or None for models
-with exact inference. A batch given for prediction holds whole movements of one length, starting
-at frame 0 (``batch.start == 0``); what a forecast has seen is exactly ``batch.values``.
+``posterior`` is the guide behind the :class:`~zoo.types.Posterior` protocol, or None for
+baselines, which have no guide. A batch given for prediction holds whole movements of one length,
+starting at frame 0 (``batch.start == 0``); what a forecast has seen is exactly ``batch.values``.
+``draws`` is how many joint draws to make; 0 asks for the moments alone.
 """
 
 from __future__ import annotations

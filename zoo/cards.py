@@ -73,7 +73,7 @@ class Card:
         yield Text(
             f"thesis {self.entry.thesis} · {self.entry.data} · can "
             f"{', '.join(self.entry.capabilities)} · {type(self.entry.inference).__name__} · "
-            f"guide: {self.entry.posterior} · default data {self.entry.dataset}\n",
+            f"guide: {self.entry.posterior} · default data {self.entry.dataset or 'none'}\n",
             style="dim",
         )
         yield from _shown(self.text)

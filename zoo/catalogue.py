@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from zoo.plugins import discover
 from zoo.registry import Entry, Registry
 from zoo.strategies import Exact, MarginalLikelihood, Svi
 
-__all__ = ["CATALOGUE", "list_models"]
+__all__ = ["CATALOGUE", "list_models", "register"]
 
 _KEPT_OUT = 0.25
 _AE_DMP = Svi(
@@ -287,7 +288,8 @@ CATALOGUE = Registry(
             data="pairs",
             dataset="uci/concrete",
         ),
-    ]
+    ],
+    discover=discover,
 )
 
 
@@ -298,3 +300,13 @@ def list_models(pattern: str = "*", *, can: str | None = None) -> list[str]:
     ['vae-dmp']
     """
     return CATALOGUE.names(pattern, can=can)
+
+
+def register(entry: Entry, *, replace: bool = False) -> None:
+    """Let a model of your own join ``zoo.list_models``, ``zoo.create``, ``zoo.card`` and the rest.
+
+    It stays for this process; a package joins every process, and the command line, by an entry
+    point of the group ``movezoo.models``. A name that is taken is refused, unless ``replace`` says
+    that an entry registered before is meant, such as by the same cell of a notebook.
+    """
+    CATALOGUE.register(entry, replace=replace)

@@ -14,7 +14,7 @@ from functools import cache
 from importlib.util import find_spec, resolve_name
 from pathlib import Path
 
-__all__ = ["hashes"]
+__all__ = ["bare", "has_source", "hashes"]
 
 _OWN = "zoo"
 # the catalogue knows every entry and the package every name: what a result takes from them is told
@@ -45,6 +45,18 @@ def hashes(roots: Iterable[str]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def has_source(module: str) -> bool:
+    """Whether a module has a file whose code can be hashed.
+
+    >>> has_source("zoo.types"), has_source("math")
+    (True, False)
+    """
+    try:
+        return _file(module) is not None
+    except (ImportError, ValueError):  # a module that was made by hand, such as __main__
+        return False
+
+
 @cache
 def _read(module: str) -> tuple[str, frozenset[str]]:
     """Hash of a module's code, and what it imports."""
@@ -54,7 +66,7 @@ def _read(module: str) -> tuple[str, frozenset[str]]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     imported = frozenset(_imports(tree, package))
-    return hashlib.sha256(ast.dump(_bare(tree)).encode()).hexdigest()[:16], imported
+    return hashlib.sha256(ast.dump(bare(tree)).encode()).hexdigest()[:16], imported
 
 
 def _imports(tree: ast.Module, package: str) -> Iterator[str]:
@@ -87,7 +99,7 @@ def _folders(package: str) -> tuple[Path, ...]:
     return tuple(Path(p) for p in (spec.submodule_search_locations or ())) if spec else ()
 
 
-def _bare(tree: ast.Module) -> ast.Module:
+def bare(tree: ast.Module) -> ast.Module:
     """The code without its docstrings."""
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:

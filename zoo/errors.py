@@ -1,6 +1,7 @@
 """Errors that say what a model, a prediction or a file honestly cannot give."""
 
 __all__ = [
+    "BrokenPluginWarning",
     "DamagedRunError",
     "ExtrapolationWarning",
     "FewGroupsWarning",
@@ -13,6 +14,7 @@ __all__ = [
     "NotCalibratedWarning",
     "NotCapableError",
     "NotFittedError",
+    "NotRegisteredError",
     "OtherTrainingError",
     "PosteriorCollapseWarning",
     "RunExistsError",
@@ -32,6 +34,10 @@ class UnknownNameError(KeyError, ValueError):
 
     def __str__(self) -> str:
         return str(self.args[0])
+
+
+class NotRegisteredError(UnknownNameError):
+    """A run is of an entry that nobody has registered here."""
 
 
 class UnanswerableError(Exception):
@@ -88,6 +94,10 @@ class MovementLengthError(UnanswerableError, ValueError):
 
 class TrainingError(RuntimeError):
     """Training failed for good; the message names site and step and what to try."""
+
+
+class BrokenPluginWarning(UserWarning):
+    """An installed package offers a model that cannot join the zoo."""
 
 
 class FewGroupsWarning(UserWarning):

@@ -16,7 +16,8 @@ from torch import nn
 
 from zoo import archive
 from zoo.assembly import Assembly
-from zoo.codehash import hashes
+from zoo.cellcode import digest, needed
+from zoo.codehash import has_source, hashes
 from zoo.datasets.digest import contents
 from zoo.datasets.records import Pairs, Sequences
 from zoo.inference.state import FREE
@@ -32,7 +33,9 @@ def fingerprint(
     """What decides the bits of ``zoo.fit``: settings, seed, data, libraries and code, by name.
 
     Digests begin with #. The number of threads is not among them: it changes the rounding, not
-    the model.
+    the model. Of a class that no module holds, such as one of a notebook, it is the code of the
+    class and of all of the notebook's own that it names; where that cannot be told, the
+    fingerprint is equal to none but that of the same class object.
 
     >>> import numpy as np, zoo
     >>> data = zoo.Sequences.from_arrays(np.random.default_rng(0).normal(size=(4, 20, 3)), rate=30.)
@@ -55,6 +58,7 @@ def fingerprint(
         **contents(val, "validation"),
         **_versions(),
         **code(_roots(assembly)),
+        **{f"code of {_path(p)}": digest(type(p)) for p in _cells(assembly)},
         "initial parameters": _initial(assembly),
     }
 
@@ -76,10 +80,27 @@ def _path(part: nn.Module | None) -> str:
 
 def _roots(assembly: Assembly) -> list[str]:
     """Modules whose code decides the result: the entry's, those of what stands in for it, ours."""
-    named = [p.partition(":")[0] for p in (assembly.entry.model, assembly.entry.guide) if p]
+    paths = [p for p in (assembly.entry.model, assembly.entry.guide) if isinstance(p, str)]
+    cells = [type(part) for part in _cells(assembly)]
+    used = [type(p).__module__ for p in (assembly.model, assembly.guide) if type(p) not in cells]
+    named = [p.partition(":")[0] for p in paths]
     own = {"zoo", *(module.partition(".")[0] for module in named)}
-    used = [type(part).__module__ for part in (assembly.model, assembly.guide)]
-    return [*named, *(m for m in used if m.partition(".")[0] in own), "zoo.training"]
+    given = [k.__module__ for k in _classes(assembly) if k not in cells]
+    beside = [module for kind in cells for module in needed(kind)]
+    kept = [m for m in used if m.partition(".")[0] in own]
+    return [*named, *given, *beside, *kept, "zoo.training"]
+
+
+def _classes(assembly: Assembly) -> list[type]:
+    """Parts that an entry names by the class itself."""
+    return [p for p in (assembly.entry.model, assembly.entry.guide) if isinstance(p, type)]
+
+
+def _cells(assembly: Assembly) -> list[nn.Module]:
+    """Parts whose class no module holds."""
+    given = _classes(assembly)
+    parts = [p for p in (assembly.model, assembly.guide) if p is not None and type(p) in given]
+    return [p for p in parts if not has_source(type(p).__module__)]
 
 
 def _settings(assembly: Assembly) -> dict[str, str]:

@@ -17,10 +17,11 @@ from zoo import archive
 from zoo.assembly import assemble
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.scaling import Scaler
-from zoo.errors import DamagedRunError, RunExistsError
+from zoo.errors import DamagedRunError, NotRegisteredError, RunExistsError, UnknownNameError
 from zoo.evaluation.calibration import recalibration_from_state
-from zoo.inference.train import Builds
+from zoo.parts import Builds
 from zoo.record import Record
+from zoo.registry import Entry, named_well
 from zoo.types import Layout
 from zoo.version import __version__
 
@@ -87,11 +88,14 @@ def save_run(run: Record, folder: Path, *, overwrite: bool = False) -> Path:
 
 
 def load_run(folder: Path, *, device: str = "cpu") -> Record:
-    """Read a run; what is damaged, foreign or of another format version is refused."""
+    """Read a run; what is damaged, foreign or of another format version is refused.
+
+    Raises NotRegisteredError where its entry is not registered.
+    """
     meta, tensors = archive.read(folder, "run", version=FORMAT_VERSION)
     try:
         return _rebuild(TypeAdapter(_Index).validate_python(meta), tensors, device)
-    except DamagedRunError:
+    except (DamagedRunError, NotRegisteredError):
         raise
     except (LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         raise DamagedRunError(f"{folder}/run.json does not describe a run: {error}") from error
@@ -124,7 +128,7 @@ def _equal(one: Tensor, other: Tensor) -> bool:
 
 
 def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Record:
-    entry, layout = CATALOGUE[index.entry], index.layout
+    entry, layout = _entry(index), index.layout
     assembly = assemble(entry, layout, index.settings, seed=index.seed, device=device)
     parts = {"model": assembly.model, "guide": assembly.guide}
     modules = {name: module for name, module in parts.items() if module is not None}
@@ -147,6 +151,21 @@ def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Record:
         },
         calibrated_on=index.calibrated_on,
     )
+
+
+def _entry(index: _Index) -> Entry:
+    """The entry of a run, which somebody must have registered."""
+    if not named_well(index.entry):
+        raise ValueError(f"no entry can be named {index.entry!r}")
+    try:
+        return CATALOGUE[index.entry]
+    except UnknownNameError as error:
+        made = index.made_of.get("model")
+        raise NotRegisteredError(
+            f"this is a run of {index.entry!r}{f' ({made})' if made else ''}, which is not "
+            "registered here: call zoo.register(entry) first, or install the package that offers "
+            f"it; {error}"
+        ) from None
 
 
 def _scaler(index: _Index) -> Scaler:

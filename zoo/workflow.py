@@ -62,7 +62,7 @@ class Plan:
             raise ValueError(f"--calibrate is one of {', '.join(methods)}; got {calibrate!r}")
         return cls(
             model=model,
-            data=data or CATALOGUE[model].dataset,
+            data=data or _own_data(model),
             settings=dict(_setting(word) for word in settings),
             by=by,
             parts=_shares(parts),
@@ -230,6 +230,14 @@ def reliability_figure(run: Run, data: Pairs | Sequences, path: Path) -> None:
     answers = [t for t in trials(run, data) if t.prediction.has_spread]
     lines = {t.task: (t.prediction, t.truth, t.mask, t.groups) for t in answers}
     reliability(lines).savefig(path, dpi=150)
+
+
+def _own_data(model: str) -> str:
+    """The data set that an entry names for itself."""
+    found = CATALOGUE[model].dataset
+    if found is None:
+        raise ValueError(f"{model} names no data set of its own: give one with --data")
+    return found
 
 
 def _setting(word: str) -> tuple[str, Any]:

@@ -16,7 +16,7 @@ from torch import Tensor
 import zoo
 from zoo import archive
 from zoo.catalogue import CATALOGUE
-from zoo.errors import DamagedRunError
+from zoo.errors import DamagedRunError, NotRegisteredError
 from zoo.storage import FORMAT_VERSION
 
 Meta, Tensors = dict[str, Any], dict[str, Tensor]
@@ -146,7 +146,6 @@ WRONG: list[tuple[str, object]] = [
     *((key, bad) for key in ("history", "versions") for bad in (None, "x", [1], {"a": 1})),
     *(("trained_on", bad) for bad in (None, "x", {}, {"name": "a", "fingerprints": 5})),
     *(("recalibrations", bad) for bad in (None, [1], {"reconstruct": {"kind": "other"}})),
-    ("entry", "no-such-model"),
     ("entry", "os:system"),
     ("entry", "gp"),
     ("settings", {"no_such_setting": 1}),
@@ -163,6 +162,14 @@ def test_an_index_of_wrong_types_is_refused(
     meta, tensors = parts
     with pytest.raises(DamagedRunError, match="does not describe a run"):
         zoo.load(forged(tmp_path / "run", {**meta, key: bad}, tensors))
+
+
+def test_a_run_of_an_entry_that_nobody_registered_is_told_of(
+    parts: tuple[Meta, Tensors], tmp_path: Path
+) -> None:
+    meta, tensors = parts
+    with pytest.raises(NotRegisteredError, match=r"'no-such-model'.* is not registered here"):
+        zoo.load(forged(tmp_path / "run", {**meta, "entry": "no-such-model"}, tensors))
 
 
 @pytest.mark.parametrize(

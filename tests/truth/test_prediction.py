@@ -214,3 +214,7 @@ def test_what_one_part_lacks_cannot_be_joined() -> None:
     wide = Predictive(location=torch.zeros(1, 2, 3), noise=torch.ones(3))
     with pytest.raises(ValueError, match="1 of 2 distributions to be joined have noise"):
         Predictive.concat([sure, wide])
+
+
+def test_no_draws_are_none() -> None:
+    assert Predictive(location=torch.zeros(1, 2, 3), draws=torch.zeros(0, 2, 3)).draws is None

@@ -6,12 +6,12 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from torch import Tensor, nn
+from torch import nn
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
@@ -22,30 +22,10 @@ from zoo.inference.minimise import MINIMISERS, Evaluate, Vector
 from zoo.inference.posterior import seeded
 from zoo.strategies import MarginalLikelihood
 
-__all__ = ["Evidence", "evaluator", "fit_marginal", "maximise"]
+__all__ = ["evaluator", "fit_marginal", "maximise"]
 
 _MOST = 32
 _log = logging.getLogger(__name__)
-
-
-class Evidence(Protocol):
-    """A model whose parameters are learned from its log evidence."""
-
-    def condition(self, data: Sequences | Pairs) -> None:
-        """Take the training data in and set the parameters to their starting values."""
-        ...
-
-    def objective(self) -> Tensor:
-        """Minus the log evidence of those data under the current parameters."""
-        ...
-
-    def settle(self) -> None:
-        """Store the posterior under the final parameters; let go of what only training needed."""
-        ...
-
-    def parameters(self) -> Iterator[nn.Parameter]:
-        """Parameters to optimise."""
-        ...
 
 
 def fit_marginal(
@@ -58,8 +38,9 @@ def fit_marginal(
     folder: Path | None = None,
     resume: Literal["never", "auto", "must"] = "never",
 ) -> list[dict[str, Any]]:
-    """Fit ``model``, an :class:`Evidence`, to scaled data; returns a row an iteration.
+    """Fit a model with an evidence to scaled data; returns a row an iteration.
 
+    ``model`` is :class:`~zoo.parts.MaximisesEvidence`.
     With ``folder`` every evaluation is kept in a journal there, from which ``resume`` goes on.
     Raises :class:`~zoo.errors.TrainingError` where the evidence is not finite at the start or
     nowhere near the best point.

@@ -2,103 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from zoo.datasets.records import Pairs, Sequences
 from zoo.inference.loader import whole
 from zoo.inference.marginal import fit_marginal
 from zoo.inference.posterior import GuidePosterior, seeded
 from zoo.inference.svi import fit_svi
+from zoo.parts import (
+    Adopts,
+    Builds,
+    Conditions,
+    LearnsNoise,
+    LearnsPrior,
+    MaximisesEvidence,
+    Prepares,
+)
 from zoo.strategies import Exact, Inference, MarginalLikelihood, Svi
-from zoo.types import Batch, Posterior
+from zoo.types import Posterior
 
-__all__ = [
-    "Adopts",
-    "Builds",
-    "Conditions",
-    "LearnsNoise",
-    "LearnsPrior",
-    "MaximisesEvidence",
-    "Prepares",
-    "Session",
-    "kept_out",
-    "train_model",
-]
+__all__ = ["Session", "kept_out", "train_model"]
 
 ENOUGH = 8
-
-
-@runtime_checkable
-class Conditions(Protocol):
-    """Exact inference: the statistics of the training data are all there is to learn."""
-
-    def condition(self, data: Sequences | Pairs) -> None:
-        """Store what prediction needs in buffers."""
-        ...
-
-
-@runtime_checkable
-class MaximisesEvidence(Conditions, Protocol):
-    """Type-II maximum likelihood over the model's parameters."""
-
-    def objective(self) -> Tensor:
-        """Negative log evidence of the data last given to ``condition``."""
-        ...
-
-
-@runtime_checkable
-class Prepares(Protocol):
-    """A model or guide with constants that are read off the training data before all else."""
-
-    def prepare(self, data: Any) -> None:
-        """Fill buffers, such as a period; the model comes before its guide."""
-        ...
-
-
-@runtime_checkable
-class Builds(Protocol):
-    """A guide that is made from its model, once that has its constants."""
-
-    def build(self) -> None:
-        """Make the parameters."""
-        ...
-
-    def moments(self) -> Mapping[str, tuple[Tensor, Tensor]]:
-        """Mean of each latent site, and a root of its covariance."""
-        ...
-
-
-@runtime_checkable
-class Adopts(Protocol):
-    """A model that predicts from a Gaussian of its latent sites, however that was found."""
-
-    def adopt(self, found: Mapping[str, tuple[Tensor, Tensor]]) -> None:
-        """Keep mean and root of the covariance of each site."""
-        ...
-
-
-@runtime_checkable
-class LearnsPrior(Protocol):
-    """A prior over whole movements, estimated from the trained guide (empirical Bayes)."""
-
-    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
-        """Store the aggregate of the training movements' latents in buffers."""
-        ...
-
-
-@runtime_checkable
-class LearnsNoise(Protocol):
-    """Noise that is estimated again on movements that no network was trained on."""
-
-    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
-        """Set the standard deviations of the observations."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,7 +109,7 @@ def _settle(model: nn.Module) -> None:
 def _exact(
     model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
 ) -> list[dict[str, Any]]:
-    _need(model, Conditions)
+    _need(model, Conditions, "condition")
     model.condition(train)
     return []
 
@@ -186,7 +117,7 @@ def _exact(
 def _marginal(
     model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
 ) -> list[dict[str, Any]]:
-    _need(model, MaximisesEvidence)
+    _need(model, MaximisesEvidence, "condition", "objective", "settle")
     return fit_marginal(
         model,
         train,
@@ -227,9 +158,13 @@ def _variational(
     return history.rows
 
 
-def _need(model: nn.Module, protocol: type) -> None:
+def _need(model: nn.Module, protocol: type, *names: str) -> None:
     if not isinstance(model, protocol):
-        raise TypeError(f"{type(model).__name__} lacks what {protocol.__name__} asks for")
+        lacking = ", ".join(n for n in names if not hasattr(model, n))
+        raise TypeError(
+            f"{type(model).__name__} has no {lacking}, which this inference calls "
+            f"(see zoo.parts.{protocol.__name__})"
+        )
 
 
 _TRAINERS: dict[type, Callable[..., list[dict[str, Any]]]] = {

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from zoo import archive
 from zoo.assembly import Assembly
+from zoo.catalogue import CATALOGUE, register
 from zoo.datasets.digest import contents
 from zoo.datasets.records import Sequences
 from zoo.ensemble import Ensemble
@@ -25,6 +26,7 @@ from zoo.fingerprint import code, fingerprint, key
 from zoo.fitting import fit
 from zoo.leaderboard.protocol import Fold, Protocol
 from zoo.prediction import Prediction, Predictive
+from zoo.registry import Entry
 from zoo.run import create
 from zoo.tasks import answered
 
@@ -135,7 +137,8 @@ def _computed(cells: Sequence[Cell], root: Path, asked: Protocol, jobs: int) -> 
     if jobs == 1:
         yield from (compute(cell, root, asked) for cell in cells)
         return
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _begin) as pool:
+    others = _registered(cells)
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _begin, (others,)) as pool:
         futures = [pool.submit(compute, cell, root, asked) for cell in cells]
         try:
             for future in as_completed(futures):
@@ -145,9 +148,25 @@ def _computed(cells: Sequence[Cell], root: Path, asked: Protocol, jobs: int) -> 
             raise
 
 
-def _begin() -> None:
-    """One thread a process, and no process that outlives the command."""
+def _registered(cells: Sequence[Cell]) -> tuple[Entry, ...]:
+    """Entries that another process must register before it can train them."""
+    names = {name for cell in cells for name, _ in cell.members}
+    found = tuple(entry for entry in CATALOGUE.joined if entry.name in names)
+    for entry in found:
+        if not entry.importable:
+            raise ValueError(
+                f"other processes cannot import the classes of {entry.name!r}: take jobs=1, or put "
+                "them into a module"
+            )
+    return found
+
+
+def _begin(others: Sequence[Entry]) -> None:
+    """One thread a process, all entries known, and no process that outlives the command."""
     torch.set_num_threads(1)
+    for entry in others:
+        if entry.name not in CATALOGUE.names():
+            register(entry)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 

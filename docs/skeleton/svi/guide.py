@@ -1,4 +1,4 @@
-"""Skeleton of a guide: copy to ``guides/NAME.py``; it knows a model by a protocol only."""
+"""Skeleton of an amortised guide: it knows a model by a protocol only."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor, nn
 
-from zoo.types import Batch, Layout
+import zoo
 
 __all__ = ["Config", "FrameGuide", "HasLatent"]
 
@@ -33,14 +33,14 @@ class FrameGuide(nn.Module):
 
     config_class: ClassVar[type] = Config
 
-    def __init__(self, layout: Layout, model: HasLatent, config: Config) -> None:
+    def __init__(self, layout: zoo.Layout, model: HasLatent, config: Config) -> None:
         """Networks for data of ``layout`` and latents of ``model``."""
         super().__init__()
         self.trunk = nn.Sequential(nn.Linear(len(layout.channels), config.hidden), nn.Tanh())
         self.mean = nn.Linear(config.hidden, model.latent_dim)
         self.log_scale = nn.Linear(config.hidden, model.latent_dim)
 
-    def forward(self, batch: Batch) -> None:
+    def forward(self, batch: zoo.Batch) -> None:
         """q(z | x), in the same plate as the model's."""
         with pyro.plate("windows", batch.total, subsample=torch.arange(len(batch))):
             q = self.encode(batch.values, batch.mask)

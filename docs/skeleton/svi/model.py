@@ -1,4 +1,4 @@
-"""Skeleton of a generative model: copy to ``zoo/models/NAME.py`` and put your mathematics in."""
+"""Skeleton of a generative model for ``zoo.Svi``: put your mathematics in."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from zoo.prediction import Predictive
-from zoo.types import Batch, Layout, Posterior
+import zoo
 
 __all__ = ["Config", "FactorModel"]
 
@@ -42,7 +41,7 @@ class FactorModel(nn.Module):
     config_class: ClassVar[type] = Config
     dtype: ClassVar[torch.dtype] = torch.float32
 
-    def __init__(self, layout: Layout, config: Config) -> None:
+    def __init__(self, layout: zoo.Layout, config: Config) -> None:
         """Parameters for data of ``layout``; they are initialised from the seed of the assembly."""
         super().__init__()
         self.layout, self.config = layout, config
@@ -50,7 +49,7 @@ class FactorModel(nn.Module):
         self.decoder = nn.Linear(config.latent_dim, len(layout.channels))
         self.log_scale = nn.Parameter(torch.zeros(len(layout.channels)))
 
-    def forward(self, batch: Batch) -> None:
+    def forward(self, batch: zoo.Batch) -> None:
         """p(x, z): the Pyro program; a plate of the whole size scales a minibatch rightly."""
         shape = (*batch.values.shape[:2], self.latent_dim)
         with pyro.plate("windows", batch.total, subsample=torch.arange(len(batch))):
@@ -59,11 +58,13 @@ class FactorModel(nn.Module):
             likelihood = dist.Normal(self.decoder(z), self.log_scale.exp())
             if batch.mask is not None:
                 likelihood = likelihood.mask(batch.mask)
-            pyro.sample("x", likelihood.to_event(2), obs=batch.values)
+            pyro.sample("x", likelihood.to_event(2), obs=batch.given(batch.values))
 
-    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+    def reconstruct(
+        self, batch: zoo.Batch, posterior: zoo.Posterior | None, *, draws: int
+    ) -> zoo.Predictive:
         """p(x̂ | x): a capability is a method; the zoo finds it by its name."""
         if posterior is None:
             raise ValueError("reconstruct needs the guide's posterior")
         z: Float[Tensor, "sample sequence time latent"] = posterior.draw(batch, draws)["z"]
-        return Predictive(location=self.decoder(z), noise=self.log_scale.exp(), joint=True)
+        return zoo.Predictive(location=self.decoder(z), noise=self.log_scale.exp(), joint=True)
