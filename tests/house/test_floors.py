@@ -17,6 +17,7 @@ FLOORS = {
     "zoo.strategies": 0,
     "zoo.registry": 0,
     "zoo.archive": 0,
+    "zoo.arguments": 0,
     "zoo.codehash": 0,
     "zoo.lock": 0,
     "zoo.inference": 1,
