@@ -6,33 +6,20 @@ from collections.abc import Mapping, Sequence, Sized
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 __all__ = [
     "Groups",
     "distinct_names",
     "group_columns",
-    "matrix",
     "pad",
-    "pad_controls",
     "rows_of",
     "stacked",
     "units_of",
 ]
 
 Groups = dict[str, tuple[str, ...]]
-
-
-def matrix(array: ArrayLike, what: str) -> NDArray[np.float64]:
-    """A non-empty finite matrix of doubles; NaN is allowed."""
-    found = np.asarray(array, dtype=np.float64)
-    if found.ndim != 2 or 0 in found.shape:
-        raise ValueError(f"{what} must be a non-empty matrix; got shape {found.shape}")
-    if np.isinf(found).any():
-        row, column = np.argwhere(np.isinf(found))[0]
-        raise ValueError(f"{what} is infinite at row {row}, column {column}")
-    return found
 
 
 def pad(parts: list[NDArray[np.float64]], width: int, what: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -47,20 +34,14 @@ def pad(parts: list[NDArray[np.float64]], width: int, what: str) -> tuple[Tensor
     return torch.nan_to_num(values), ~torch.isnan(values), lengths
 
 
-def pad_controls(controls: Sequence[ArrayLike], lengths: Tensor) -> Tensor:
-    """Padded controls, complete and as long as their sequences."""
-    parts = [matrix(c, f"controls of sequence {i}") for i, c in enumerate(controls)]
-    if [len(p) for p in parts] != lengths.tolist():
-        raise ValueError("controls and arrays must have the same lengths, sequence by sequence")
-    if any(np.isnan(p).any() for p in parts):
-        raise ValueError("controls must be complete; found NaN")
-    return pad(parts, parts[0].shape[1], "controls")[0]
-
-
 def distinct_names(names: Sequence[str] | None, count: int, what: str) -> tuple[str, ...]:
     """The names given, or numbered ones."""
     if names is None:
         return tuple(f"{what}_{i}" for i in range(count))
+    if isinstance(names, str):
+        raise TypeError(f"{what} names must come as a list; got the string {names!r}")
+    if any(not isinstance(n, str) for n in names):
+        raise TypeError(f"{what} names must be text; got {list(names)}")
     if len(names) != count or len(set(names)) != count:
         raise ValueError(f"{count} distinct {what} names are needed; got {list(names)}")
     return tuple(names)
@@ -89,11 +70,27 @@ def group_columns(
     return {key: tuple(str(v) for v in column) for key, column in groups.items()}
 
 
-def rows_of(index: int | slice | Sequence[int], count: int) -> list[int]:
-    """Row numbers of an index, checked."""
+def rows_of(index: object, count: int) -> list[int]:
+    """Row numbers of an index: a number, a slice, numbers, or a truth value for every row.
+
+    >>> rows_of([True, False, True], 3), rows_of(-1, 3), rows_of(slice(1, 3), 3)
+    ([0, 2], [2], [1, 2])
+    """
     if isinstance(index, slice):
         return list(range(count))[index]
-    rows = [index] if isinstance(index, int) else [int(i) for i in index]
+    if index is None or isinstance(index, str | bool | float):
+        raise TypeError(f"rows are chosen by numbers, a slice or truth values; got {index!r}")
+    found = np.asarray(index.cpu() if isinstance(index, Tensor) else index)
+    if found.ndim > 1 or (found.size and found.dtype.kind not in "iub"):
+        raise TypeError(
+            f"rows are chosen by whole numbers or truth values in a row; got {found.dtype} of "
+            f"shape {found.shape}"
+        )
+    if found.dtype.kind == "b":
+        if found.shape != (count,):
+            raise ValueError(f"{count} rows need {count} truth values; got shape {found.shape}")
+        return [int(r) for r in np.flatnonzero(found)]
+    rows = [int(r) for r in np.atleast_1d(found)]
     if any(not -count <= r < count for r in rows):
         raise IndexError(f"row {max(rows, key=abs)} of {count}")
     return [r % count for r in rows]

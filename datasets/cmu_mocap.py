@@ -118,6 +118,7 @@ def load(
         },
         notes=notes,
         name=f"{DATASET}/{what}",
+        provenance="public",
     )
     if rate is not None:
         return data.resampled(rate=rate)

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 from torch import Tensor
 
+from zoo.datasets.agreement import labels_of
 from zoo.datasets.checks import (
     Groups,
     distinct_names,
     group_columns,
-    matrix,
     rows_of,
     units_of,
 )
+from zoo.datasets.labelled import check_same_items, items
 from zoo.datasets.split import matching_rows, named_columns, split_rows
 from zoo.types import Layout
 
@@ -42,7 +43,7 @@ class Pairs:
     units: tuple[str, ...]
     groups: Groups = field(default_factory=dict)
     name: str = "pairs"
-    provenance: str = "public"
+    provenance: str = "own"
 
     def __repr__(self) -> str:
         """Sizes, targets, units and groups in one line."""
@@ -56,8 +57,8 @@ class Pairs:
     @classmethod
     def from_arrays(
         cls,
-        inputs: ArrayLike,
-        targets: ArrayLike,
+        inputs: Any,
+        targets: Any,
         *,
         features: Sequence[str] | None = None,
         feature_units: str | Sequence[str] = "",
@@ -65,33 +66,38 @@ class Pairs:
         units: str | Sequence[str] = "",
         groups: Mapping[str, Sequence[object]] | None = None,
         name: str = "pairs",
-        provenance: str = "public",
+        provenance: str = "own",
     ) -> Self:
         """Pairs from arrays (item, feature) and (item, target); NaN marks a missing target.
+
+        Masked entries are missing too. Frames (pandas, polars, Arrow) and xarray's arrays tell
+        names and units themselves; the index of both, where they have one, must be the same.
 
         >>> import numpy as np
         >>> pairs = Pairs.from_arrays(np.zeros((4, 3)), np.ones(4), channels=["f_z"], units="N")
         >>> pairs.inputs.shape, pairs.targets.shape, pairs.units
         (torch.Size([4, 3]), torch.Size([4, 1]), ('N',))
         """
-        x = matrix(inputs, "inputs")
-        t = np.asarray(targets, dtype=np.float64)
-        y = matrix(t[:, None] if t.ndim == 1 else t, "targets")
+        given, asked = items(inputs, features, "inputs"), items(targets, channels, "targets")
+        check_same_items(given, asked)
+        x, y = given.part.values, asked.part.values
         if len(x) != len(y):
             raise ValueError(f"inputs have {len(x)} items, targets {len(y)}")
         if np.isnan(x).any():
             row, column = np.argwhere(np.isnan(x))[0]
-            raise ValueError(f"inputs must be complete; item {row}, feature {column} is NaN")
-        names = distinct_names(features, x.shape[1], "feature")
-        targets_ = distinct_names(channels, y.shape[1], "target")
+            raise ValueError(f"inputs must be complete; item {row}, feature {column} is missing")
+        x, names, known_units = labels_of(given.part, features, feature_units)
+        y, asked_names, asked_units = labels_of(asked.part, channels, units)
+        names = distinct_names(names, x.shape[1], "feature")
+        targets_ = distinct_names(asked_names, y.shape[1], "target")
         return cls(
             inputs=torch.from_numpy(x.copy()),
             targets=torch.from_numpy(np.nan_to_num(y, copy=True)),
             mask=torch.from_numpy(~np.isnan(y)),
             features=names,
-            feature_units=units_of(feature_units, len(names)),
+            feature_units=units_of(known_units, len(names)),
             channels=targets_,
-            units=units_of(units, len(targets_)),
+            units=units_of(asked_units, len(targets_)),
             groups=group_columns(groups, len(x), "items", "item"),
             name=name,
             provenance=provenance,
@@ -101,8 +107,8 @@ class Pairs:
         """Number of items."""
         return int(self.inputs.shape[0])
 
-    def __getitem__(self, index: int | slice | Sequence[int]) -> Self:
-        """A subset of the items."""
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor | NDArray[Any]) -> Self:
+        """A subset of the items: by numbers, a slice, or a truth value for each."""
         rows = rows_of(index, len(self))
         return replace(
             self,

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Real
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from torch import Tensor
 
 from zoo.datasets.checks import (
     Groups,
     distinct_names,
     group_columns,
-    matrix,
     pad,
-    pad_controls,
     rows_of,
     units_of,
 )
+from zoo.datasets.controls import known_controls
+from zoo.datasets.labelled import movements
 from zoo.datasets.resample import resample_movements
 from zoo.datasets.split import matching_rows, named_columns, split_rows
 from zoo.datasets.windows import cut
@@ -40,7 +38,8 @@ class Sequences:
     in ``mask``. ``controls`` are known inputs of every frame (actions), with their own names;
     they may run on past the last frame where those of a forecast are known.
     ``rate`` is in Hz; where ``time_normalised``, every movement was stretched to one length, and it
-    is that of the mean duration. ``provenance`` is ``public``, ``thesis`` or ``simulated``.
+    is that of the mean duration. ``provenance`` is ``own``, ``public``, ``thesis`` or
+    ``simulated``.
     ``notes`` say what a loader changed in the recording.
     """
 
@@ -57,12 +56,12 @@ class Sequences:
     time_normalised: bool = False
     notes: tuple[str, ...] = ()
     name: str = "sequences"
-    provenance: str = "public"
+    provenance: str = "own"
 
     def __repr__(self) -> str:
         """Sizes, channels, units, rate and groups in one line."""
         lengths = sorted(set(self.lengths.tolist()))
-        frames = f"{lengths[0]}–{lengths[-1]}" if len(lengths) > 1 else f"{lengths[0]}"
+        frames = f"{lengths[0]}–{lengths[-1]}" if len(lengths) > 1 else f"{max(lengths, default=0)}"
         units = "/".join(dict.fromkeys(u for u in self.units if u)) or "no unit"
         return (
             f"Sequences {self.name!r} ({self.provenance}): {len(self)} movements of {frames} "
@@ -73,21 +72,33 @@ class Sequences:
     @classmethod
     def from_arrays(
         cls,
-        arrays: Sequence[ArrayLike] | NDArray[np.floating],
+        arrays: Any,
         *,
-        rate: float,
+        rate: float | None = None,
         channels: Sequence[str] | None = None,
         units: str | Sequence[str] = "",
         groups: Mapping[str, Sequence[object]] | None = None,
-        controls: Sequence[ArrayLike] | None = None,
+        controls: Any = None,
         control_names: Sequence[str] | None = None,
         control_units: str | Sequence[str] = "",
         time_normalised: bool = False,
         notes: Sequence[str] = (),
         name: str = "sequences",
-        provenance: str = "public",
+        provenance: str = "own",
     ) -> Self:
-        """Sequences from a list of arrays (time, channel); NaN marks a missing entry.
+        """Sequences from arrays (time, channel); NaN and masked entries are missing.
+
+        ``arrays`` is a list of them, an array (movement, time, channel), or one movement as an
+        array (time, channel). One dimension makes a movement only where it is named, by
+        ``channels=["knee"]`` or as a labelled array. Frames (pandas, polars, Arrow) and xarray's
+        arrays tell names, units, times and groups themselves (see
+        :func:`~zoo.datasets.columns.parts_of_table` and
+        :func:`~zoo.datasets.xarrays.parts_of_labelled`); columns are brought to the order of the
+        first, or of ``channels``, by name. ``rate`` is in Hz; where the data have regular times it
+        may be left out, and must agree. ``groups`` has a column with a row for each movement.
+
+        Raises TypeError for what holds no real numbers and ValueError for what is irregular,
+        infinite or contradictory, naming the movement.
 
         >>> import numpy as np
         >>> data = Sequences.from_arrays([np.zeros((5, 2)), np.ones((7, 2))], rate=100.0,
@@ -95,38 +106,31 @@ class Sequences:
         >>> len(data), data.lengths.tolist(), data.channels
         (2, [5, 7], ('hip', 'knee'))
         """
-        parts = [matrix(a, f"sequence {i}") for i, a in enumerate(arrays)]
-        if not parts:
-            raise ValueError("arrays is empty; at least one sequence is needed")
-        if not isinstance(rate, Real) or not 0 < rate < math.inf:
-            raise ValueError(f"rate must be a positive number, in Hz; got {rate!r}")
-        names = distinct_names(channels, parts[0].shape[1], "channel")
-        values, mask, lengths = pad(parts, len(names), "channels")
-        known = None if controls is None else pad_controls(controls, lengths)
-        width = 0 if known is None else known.shape[2]
+        found = movements(arrays, channels=channels, units=units, rate=rate, groups=groups)
+        names = distinct_names(found.names, found.arrays[0].shape[1], "channel")
+        values, mask, lengths = pad(found.arrays, len(names), "channels")
+        known = known_controls(controls, control_names, control_units, found.rate, lengths)
         return cls(
             values=values,
             mask=mask,
             lengths=lengths,
             channels=names,
-            units=units_of(units, len(names)),
-            rate=float(rate),
-            groups=group_columns(groups, len(parts), "sequences", "trial"),
-            controls=known,
-            control_names=distinct_names(control_names, width, "control"),
-            control_units=units_of(control_units, width),
+            units=units_of(found.units, len(names)),
+            rate=found.rate,
+            groups=group_columns(found.groups, len(lengths), "sequences", "trial"),
             time_normalised=time_normalised,
             notes=tuple(notes),
             name=name,
             provenance=provenance,
+            **known,
         )
 
     def __len__(self) -> int:
         """Number of movements."""
         return int(self.values.shape[0])
 
-    def __getitem__(self, index: int | slice | Sequence[int]) -> Self:
-        """A subset of the movements."""
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor | NDArray[Any]) -> Self:
+        """A subset of the movements: by numbers, a slice, or a truth value for each."""
         rows = rows_of(index, len(self))
         lengths = self.lengths[rows]
         end = int(lengths.max()) if len(rows) else 0

@@ -59,7 +59,8 @@ def load(
         raise FileFormatError(
             files.path("index_target.txt"), None, f"columns {set(x) & set(y)} are features as well"
         )
-    pairs = Pairs.from_arrays(table[:, x], table[:, y], name=f"uci/{what}")
+    provenance = "public" if what in COLUMNS else "own"
+    pairs = Pairs.from_arrays(table[:, x], table[:, y], name=f"uci/{what}", provenance=provenance)
     if what in COLUMNS:
         pairs = _named(pairs, COLUMNS[what])
     return pairs if split is None else _published(files, pairs, split)

@@ -22,6 +22,7 @@ FLOORS = {
     "zoo.plugins": 0,
     "zoo.cellcode": 0,
     "zoo.archive": 0,
+    "zoo.arguments": 0,
     "zoo.codehash": 0,
     "zoo.lock": 0,
     "zoo.inference": 1,

@@ -66,6 +66,7 @@ def both() -> Sequences:
             "movement": ["walking"] * len(walk) + ["jogging"] * len(jog),
         },
         name=f"walking and jogging cut into {FRAMES} frames",
+        provenance=walk.provenance,
     )
 
 
@@ -87,6 +88,7 @@ def _record(data: Sequences, arrays: Sequence[Column], trials: Sequence[object])
         units=data.units,
         groups={"trial": trials},
         name=f"{data.name} cut into {FRAMES} frames",
+        provenance=data.provenance,
     )
 
 
