@@ -118,7 +118,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from zoo.leaderboard.cells import _begin
 if __name__ == "__main__":
-    pool = ProcessPoolExecutor(1, get_context("spawn"), _begin)
+    pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, ((),))
     print(pool.submit(os.getpid).result(), flush=True)
     pool.submit(time.sleep, 60)
     time.sleep(60)
