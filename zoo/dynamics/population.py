@@ -11,6 +11,7 @@ the same form, exactly.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -193,7 +194,7 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
     informed = (precision @ kept).flatten(-3, -2)
     shared = shared_eye + factors.flatten(-3, -2).mT @ informed
     shared_root = torch.linalg.cholesky((shared + shared.mT) / 2)
-    shared_linear = (error.flatten(-2)[..., None, :] @ kept.flatten(-3, -2))[..., 0, :]
+    shared_linear = _across(kept.flatten(-3, -2).mT, error.flatten(-2))
     log_volume = root.diagonal(dim1=-2, dim2=-1).log().sum((-1, -2))
     return _Solved(
         error=error,
@@ -202,7 +203,7 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
         private=private,
         shared_root=shared_root,
         shared_linear=shared_linear,
-        shared_mean=torch.cholesky_solve(shared_linear[..., None], shared_root)[..., 0],
+        shared_mean=_across(shared_root, shared_linear, torch.cholesky_solve),
         log_volume=log_volume + shared_root.diagonal(dim1=-2, dim2=-1).log().sum(-1),
         eye=shared_eye,
     )
@@ -213,8 +214,23 @@ def _times(
 ) -> Float[Tensor, "*rows channel p"]:
     if matrix.ndim == 3:
         return torch.einsum("cpq,...cq->...cp", matrix, vector)
-    product: Tensor = matrix @ vector[..., None]
-    return product[..., 0]
+    if matrix.shape[-4] > 1 or vector.ndim < 3:
+        product: Tensor = matrix @ vector[..., None]
+        return product[..., 0]
+    columns: Tensor = matrix.squeeze(-4) @ vector.movedim(-3, -1)
+    return columns.movedim(-1, -3)
+
+
+def _across(
+    matrix: Float[Tensor, "*#sequence p q"],
+    vector: Float[Tensor, "*batch q"],
+    solve: Callable[[Tensor, Tensor], Tensor] = lambda b, a: a @ b,
+) -> Float[Tensor, "*rows p"]:
+    """Matrix times vector; a matrix of all movements takes their vectors as columns."""
+    if vector.ndim == 1 or (matrix.ndim > 2 and matrix.shape[-3] > 1):
+        return solve(vector[..., None], matrix)[..., 0]
+    shared = matrix.squeeze(-3) if matrix.ndim > 2 else matrix
+    return solve(vector.mT, shared).mT
 
 
 def _root(covariance: Float[Tensor, "*c p p"]) -> Float[Tensor, "*c p p"]:
