@@ -113,9 +113,9 @@ class Predictive:
     def affine(self, scale: Tensor, shift: Tensor) -> Predictive:
         """The same distribution of ``scale * y + shift`` (both broadcast over the last axis)."""
         return Predictive(
-            location=self.location * scale + shift,
-            noise=None if self.noise is None else self.noise * scale.abs(),
-            epistemic=None if self.epistemic is None else self.epistemic * scale.abs(),
+            location=torch.addcmul(shift, self.location, scale),
+            noise=None if self.noise is None else _widened(self.noise, scale.abs()),
+            epistemic=None if self.epistemic is None else _widened(self.epistemic, scale.abs()),
             joint=self.joint,
             draws=self.redrawn(lambda draws: draws * scale + shift),
         )
@@ -133,6 +133,12 @@ class Predictive:
     def _held(self) -> Deferred | Tensor | None:
         held: Deferred | Tensor | None = self.__dict__["_draws"]
         return held
+
+
+def _widened(spread: Tensor, scale: Tensor) -> Tensor:
+    """Spread times scale; what is the same along an axis is multiplied once."""
+    once = spread[tuple(slice(0, 1 if step == 0 else None) for step in spread.stride())]
+    return (once * scale).expand(torch.broadcast_shapes(spread.shape, scale.shape))
 
 
 def pooled(parts: Sequence[Predictive]) -> Predictive:

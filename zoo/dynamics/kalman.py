@@ -193,7 +193,8 @@ def _parts(noise: PathNoise) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _cut(x: Tensor, noise: PathNoise) -> Float[Tensor, "*#pattern block step column"]:
-    full: Tensor = pad(x, (0, 0, 0, noise.blocks * noise.block - noise.frames))
+    short = noise.blocks * noise.block - noise.frames
+    full: Tensor = pad(x, (0, 0, 0, short)) if short else x
     blocks: Tensor = full.unflatten(-2, (noise.blocks, noise.block))
     return blocks
 

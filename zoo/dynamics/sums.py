@@ -18,6 +18,7 @@ __all__ = [
     "Movements",
     "Sight",
     "Sums",
+    "in_parts",
     "of_weights",
     "sights",
     "square_after",
@@ -169,14 +170,21 @@ def sums_of(
         (view,) = sights(primitive, [timings[rows[0]]], ratio, seen)
         frames, begun = len(seen), max(2, len(seen) // 4)
         x = torch.stack([movements[i][0] for i in rows]) * seen
-        found = []
-        for part in x.split(max(1, COLUMNS // x.shape[2])):
-            errors, n = view.errors(part), len(part)
-            found.append((view.sums(errors, n, frames), view.sums(errors, n, begun)))
-        parts.append([_joined(each) for each in zip(*found, strict=True)])
+        parts.append(in_parts(x, [(view, frames), (view, begun)]))
     back = torch.tensor(order).argsort()
     whole, early = (_together(each, back) for each in zip(*parts, strict=True))
     return whole, early
+
+
+def in_parts(
+    x: Float[Tensor, "sequence time channel"], asked: Sequence[tuple[Sight, int]]
+) -> list[Sums]:
+    """What the first frames of movements say at timings of one tempo, some movements at a time."""
+    found = []
+    for part in x.split(max(1, COLUMNS // x.shape[2])):
+        errors = asked[0][0].errors(part)
+        found.append([view.sums(errors, len(part), frames) for view, frames in asked])
+    return [_joined(each) for each in zip(*found, strict=True)]
 
 
 def squares(
