@@ -234,7 +234,8 @@ def _evidence_of_scales(
         wide = 1 + s.square() * d
         shared = eye + factors.mT @ (factors * (s.square() * d / wide)[:, None])
         root = torch.linalg.cholesky(shared)
-        pull = torch.linalg.solve_triangular(root, s * factors.mT @ (white / wide).mT, upper=False)
+        told = factors.mT @ (s * white / wide).mT
+        pull = torch.linalg.solve_triangular(root, told, upper=False)
         private = (s * white).square() @ (1 / wide)
         volume = wide.log().sum() / 2 + root.diagonal().log().sum()
         found.append((private + pull.square().sum(0)) / 2 - volume)

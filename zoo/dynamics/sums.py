@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 Movements = list[tuple[Tensor, Tensor]]
-COLUMNS = 1000
+COLUMNS = 500
 SEQUENCE, CHANNEL = (-4, -3, -2, -2, -2), (-3, -2, -1, -1, -1)
 
 
@@ -149,11 +149,21 @@ def sights(
 
     def smoother(unit: float) -> Smoother:
         noise = PathNoise(primitive.system(Timing(unit)), frames)
-        found = Smoother.of(noise, ratios, known)
+        if bool(known.all()):
+            found = _complete(noise, tuple(ratios.flatten().tolist()), ratios.shape)
+        else:
+            found = Smoother.of(noise, ratios, known)
         return found if index is None else found.at(index)
 
     shared = {unit: smoother(unit) for unit in {t.unit for t in timings}}
     return [Sight(shared[t.unit], roll_out(primitive, frames, t)) for t in timings]
+
+
+@lru_cache(maxsize=8)
+def _complete(noise: PathNoise, ratios: tuple[float, ...], shape: torch.Size) -> Smoother:
+    """The smoother of movements without gaps, which are all alike."""
+    ratio = torch.tensor(ratios, dtype=torch.float64).view(shape)
+    return Smoother.of(noise, ratio, torch.ones(shape[-1], noise.frames, dtype=torch.bool))
 
 
 def sums_of(
