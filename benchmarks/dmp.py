@@ -20,7 +20,7 @@ from torch import Tensor
 
 import zoo
 from benchmarks.harness import Timings, interleave, ratio, report, store
-from zoo.dynamics import kalman, rollout
+from zoo.dynamics import kalman, rollout, sums
 from zoo.dynamics.dmp import Response, Transformation, discrete_basis, phase
 from zoo.dynamics.imitation import fit_matrix, trajectory_matrix
 from zoo.inference.loader import whole
@@ -58,7 +58,7 @@ def cold(call: Callable[[], object]) -> Callable[[], object]:
     """The call after all kept responses were dropped."""
 
     def dropped() -> object:
-        for kept in (Response.of, rollout.roll_out, kalman._parts):
+        for kept in (Response.of, rollout.roll_out, kalman._parts, sums._complete):
             kept.cache_clear()
         return call()
 

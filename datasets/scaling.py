@@ -109,7 +109,8 @@ class Scaler:
         return cls(kind=saved["kind"], constant=tuple(saved["constant"]), **tensors)
 
     def _scaled(self, values: Tensor, mask: Tensor) -> Tensor:
-        return torch.where(mask, (values - self.channel_shift) / self.channel_scale, 0.0)
+        scaled = (values - self.channel_shift).div_(self.channel_scale)
+        return scaled if bool(mask.all()) else scaled.masked_fill_(~mask, 0.0)
 
 
 def _observed(data: Pairs | Sequences) -> tuple[Tensor, Tensor]:

@@ -44,7 +44,7 @@ class Exchange:
 
     def unscaled(self, predictive: Predictive, task: str) -> Predictive:
         """A finite answer in the data's units."""
-        if not bool(predictive.location.isfinite().all()):
+        if not _finite(predictive.location):
             raise FloatingPointError(
                 f"{self.assembly.entry.name}: {task} gave values that are not finite"
             )
@@ -79,7 +79,8 @@ class Exchange:
         with seeded(seed, self.assembly.device), torch.no_grad():
             for length in sorted(set(lengths)):
                 rows = [i for i, n in enumerate(lengths) if n == length]
-                parts.append((rows, answer(whole(scaled[rows]), posterior, rows)))
+                some = scaled if len(rows) == len(scaled) else scaled[rows]
+                parts.append((rows, answer(whole(some), posterior, rows)))
                 frames[rows] = parts[-1][1].location.shape[2]
         return parts[0][1] if len(parts) == 1 else _merge(parts), frames
 
@@ -200,6 +201,11 @@ def question(task: str, data: Sequences) -> str:
     inside = torch.arange(data.values.shape[1]) < data.lengths[:, None]
     section = bool((inside & ~data.mask.any(-1)).any())
     return "impute section" if section else "impute joints"
+
+
+def _finite(values: Tensor) -> bool:
+    """Whether all are finite; a finite sum says so at once."""
+    return bool(values.sum().isfinite()) or bool(values.isfinite().all())
 
 
 def fingerprints(data: Pairs | Sequences) -> list[str]:

@@ -115,9 +115,9 @@ class Predictive:
     def affine(self, scale: Tensor, shift: Tensor) -> Predictive:
         """The same distribution of ``scale * y + shift`` (both broadcast over the last axis)."""
         return Predictive(
-            location=self.location * scale + shift,
-            noise=None if self.noise is None else self.noise * scale.abs(),
-            epistemic=None if self.epistemic is None else self.epistemic * scale.abs(),
+            location=torch.addcmul(shift, self.location, scale),
+            noise=None if self.noise is None else _widened(self.noise, scale.abs()),
+            epistemic=None if self.epistemic is None else _widened(self.epistemic, scale.abs()),
             joint=self.joint,
             draws=self.redrawn(lambda draws: draws * scale + shift),
         )
@@ -199,6 +199,12 @@ def _joined_draws(parts: Sequence[Deferred | Tensor | None]) -> Deferred | Tenso
         return torch.cat([p.tensor() if isinstance(p, Deferred) else p for p in known], 1)
 
     return Deferred(shape, make, seed=0)
+
+
+def _widened(spread: Tensor, scale: Tensor) -> Tensor:
+    """Spread times scale; what is the same along an axis is multiplied once."""
+    once = spread[tuple(slice(0, 1 if step == 0 else None) for step in spread.stride())]
+    return (once * scale).expand(torch.broadcast_shapes(spread.shape, scale.shape))
 
 
 def pooled(parts: Sequence[Predictive]) -> Predictive:

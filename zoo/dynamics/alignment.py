@@ -64,6 +64,8 @@ def extremes(
             [2.]])
     """
     flat, seen = values.flatten(0, 1), mask.flatten(0, 1)
+    if bool(seen.all()):
+        return torch.stack([flat.amin(0), flat.amax(0)])
     low = flat.masked_fill(~seen, torch.inf).amin(0)
     high = flat.masked_fill(~seen, -torch.inf).amax(0)
     return torch.stack([low, high])

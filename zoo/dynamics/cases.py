@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import pyro.distributions as dist
 import torch
@@ -16,7 +17,7 @@ from zoo.dynamics.components import Components, Paths, alike, resample
 from zoo.dynamics.movement_law import Noise
 from zoo.dynamics.population import Population
 from zoo.dynamics.rollout import Primitive, Timing
-from zoo.dynamics.sums import Sight, Sums, sights
+from zoo.dynamics.sums import Sight, Sums, in_parts, sights
 
 __all__ = ["Case", "Cases", "Group", "Posteriors", "Unknowns"]
 
@@ -79,8 +80,8 @@ class Unknowns(ABC):
 
     def evidence(self, group: Group) -> Float[Tensor, "timing scale sequence"]:
         """log ∫ p(θ) p(x | θ)^information dθ of every timing and scale."""
-        scaled, variance = self.population.scaled(self.scales), self.noise.std.square()
-        fits = [scaled.log_evidence(*self.likelihood(s)) for s in group.sums]
+        population, variance = self.population, self.noise.std.square()
+        fits = [population.log_evidences(self.scales, *self.likelihood(s)) for s in group.sums]
         at_zero = [self.information * s.log_density(variance) for s in group.sums]
         pairs = zip(at_zero, fits, strict=True)
         return torch.stack([zero + fit for zero, fit in pairs])
@@ -123,12 +124,12 @@ class Cases(Unknowns):
     ) -> Iterator[Sighted]:
         """What the movements say of θ; the errors of timings of one tempo are the same."""
         for rows, mask in alike(seen):
-            x = values[rows] * mask
+            x = values if len(rows) == len(values) else values[rows]
+            x = x if bool(mask.all()) else x * mask
             views = sights(self.primitive, self.timings, self.noise.ratio, mask)
-            first = {t.unit: v for t, v in zip(self.timings, views, strict=True)}
-            errors = {unit: view.errors(x) for unit, view in first.items()}
-            pairs = zip(self.timings, views, strict=True)
-            sums = [v.sums(errors[t.unit], *x.shape[:2]) for t, v in pairs]
+            sums = list[Sums]()
+            for _, same in groupby(zip(self.timings, views, strict=True), lambda p: p[0].unit):
+                sums += in_parts(x, [(view, x.shape[1]) for _, view in same])
             yield Sighted(rows, x, sums, views)
 
     def chosen(
@@ -143,10 +144,13 @@ class Cases(Unknowns):
         self, values: Tensor, seen: Tensor, count: int, render: Callable[[Case], Paths]
     ) -> Components:
         """Paths that ``render`` makes of every case, a mixture of ``count`` of them."""
-        parts = Components.empty(count, values)
+        parts = None
         for rows, which, case in self.chosen(values, seen, count):
+            if count == 1 and len(rows) == len(values):
+                return Components.alone(render(case))
+            parts = Components.empty(count, values) if parts is None else parts
             parts.put(rows, which, render(case))
-        return parts
+        return parts or Components.empty(count, values)
 
     def demonstrated(self, values: Tensor, seen: Tensor) -> list[Case]:
         """The likeliest timing of every movement, with the usual scale, and p(θ | x)."""
@@ -160,7 +164,8 @@ class Cases(Unknowns):
     def case(self, group: Sighted, timing: int, scale: Tensor, some: Tensor) -> Case:
         """p(θ | x) of some movements of a group."""
         posterior = self.posterior(group, timing, scale, some)
-        return Case(posterior, group.sights[timing], self.timings[timing], group.x[some])
+        x = group.x if len(some) == len(group.x) and bool(some.all()) else group.x[some]
+        return Case(posterior, group.sights[timing], self.timings[timing], x)
 
 
 class Posteriors:

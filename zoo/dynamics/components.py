@@ -21,7 +21,7 @@ class Paths:
     """Mean and variance of the path at every time; ``draw`` gives so many joint draws of it."""
 
     mean: Float[Tensor, "sequence time channel"]
-    variance: Float[Tensor, "sequence time channel"]
+    variance: Float[Tensor, "*#sequence time channel"]
     draw: Draw
 
 
@@ -30,7 +30,7 @@ class Components:
     """Moments of every component; draws are of all in turn, or of some from first to last."""
 
     mean: Float[Tensor, "component sequence time channel"]
-    variance: Float[Tensor, "component sequence time channel"]
+    variance: Float[Tensor, "component #sequence time channel"]
     pieces: list[tuple[int, Tensor, Tensor, Draw]] = field(default_factory=list)
     begin: int = 0
 
@@ -39,6 +39,15 @@ class Components:
         """Room for ``count`` components of movements shaped ``like``."""
         mean = like.new_zeros(count, *like.shape)
         return cls(mean, torch.zeros_like(mean))
+
+    @classmethod
+    def alone(cls, paths: Paths) -> Components:
+        """One component, ``paths`` of all movements."""
+        every = torch.ones(len(paths.mean), dtype=torch.bool)
+        piece = (0, torch.arange(len(every)), every, paths.draw)
+        frames, channels = paths.variance.shape[-2:]
+        variance = paths.variance.reshape(1, -1, frames, channels)
+        return cls(paths.mean[None], variance, [piece])
 
     @classmethod
     def of(cls, parts: list[Paths]) -> Components:
@@ -55,9 +64,10 @@ class Components:
         paths: Paths,
     ) -> None:
         """Fill in ``paths`` of the movements ``rows`` where they are the component chosen."""
+        variance = paths.variance.expand_as(paths.mean)
         for component, here in enumerate(chosen):
             self.mean[component, rows[here]] = paths.mean[here]
-            self.variance[component, rows[here]] = paths.variance[here]
+            self.variance[component, rows[here]] = variance[here]
             if bool(here.any()):
                 self.pieces.append((component, rows[here], here, paths.draw))
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 FLOOR = 1e-8
 GRID = 121
+ENTRIES = 2**18
 
 __all__ = ["Weights", "conjugate_weights"]
 
@@ -49,8 +50,9 @@ def conjugate_weights(
     total = count.sum(0).clamp_min(1)
     grid = torch.logspace(-9, 3, GRID, dtype=s.dtype, device=s.device) * s.mean()
     energy = β.square().sum(0, keepdim=True) if len(s) == 1 else β.square()
-    scores = torch.stack([_profile(s, energy, square.sum(0), len(β), total, λ) for λ in grid])
-    λ = grid[scores.argmax(0)]
+    some = grid.split(max(1, ENTRIES // s.numel()))
+    scores = [_profile(s, energy, square.sum(0), len(β), total, λ) for λ in some]
+    λ = grid[torch.cat(scores, -1).argmax(-1)]
     shrunk = s + λ[:, None]
     energy = (square - (β.square() / shrunk).sum(-1)).clamp_min(0)
     noise = (energy.sum(0) / total).clamp_min(FLOOR)
@@ -66,9 +68,16 @@ def conjugate_weights(
 
 
 def _profile(
-    s: Tensor, explained: Tensor, square: Tensor, sequences: int, total: Tensor, λ: Tensor
-) -> Tensor:
-    """Log evidence of every channel at λ with the best σ², up to a constant."""
-    energy = square - (explained / (s + λ)).sum((0, -1))
-    volume = ((s + λ) / λ).log().sum((0, -1)) / 2 * (sequences / len(s))
-    return -total / 2 * (energy / total).clamp_min(FLOOR).log() - volume
+    s: Tensor,
+    explained: Tensor,
+    square: Tensor,
+    sequences: int,
+    total: Tensor,
+    λ: Float[Tensor, " grid"],
+) -> Float[Tensor, "channel grid"]:
+    """Log evidence of every channel at every λ with the best σ², up to a constant."""
+    shrunk = s[..., None] + λ
+    energy = square[:, None] - torch.einsum("sck,sckg->cg", explained, 1 / shrunk)
+    volume = (shrunk / λ).log().sum((0, -2)) / 2 * (sequences / len(s))
+    best = (energy / total[:, None]).clamp_min(FLOOR)
+    return -total[:, None] / 2 * best.log() - volume

@@ -174,13 +174,24 @@ class Smoother:
     def _errors(self, x: Tensor) -> Float[Tensor, "*#pattern block step column"]:
         """L⁻¹ (x − O a) of every block."""
         power = _parts(self.noise)[2]
-        errors = self.unroot @ _cut(x, self.noise)
+        errors = self._unrooted(_cut(x, self.noise))
         state = errors.new_zeros(*errors.shape[:-3], 2, errors.shape[-1])
         parts = (v.unbind(-3) for v in (errors, self.begin, self.onward))
         for error, begin, onward in zip(*parts, strict=True):
             error -= begin @ state
             state = power @ state + onward @ error
         return errors
+
+    def _unrooted(
+        self, blocks: Float[Tensor, "*#pattern block step column"]
+    ) -> Float[Tensor, "*#pattern block step column"]:
+        """L⁻¹ of every block by itself; all ρ in one product where x is the same for them."""
+        if self.unroot.ndim == 4 or blocks.ndim > 4:
+            return self.unroot @ blocks
+        ratios, size = self.unroot.shape[0], self.unroot.shape[-1]
+        rows = self.unroot.movedim(0, -3).flatten(-3, -2)
+        both: Tensor = (rows @ blocks).unflatten(-2, (ratios, size))
+        return both.movedim(-3, 0)
 
 
 @lru_cache(maxsize=64)
@@ -193,7 +204,8 @@ def _parts(noise: PathNoise) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _cut(x: Tensor, noise: PathNoise) -> Float[Tensor, "*#pattern block step column"]:
-    full: Tensor = pad(x, (0, 0, 0, noise.blocks * noise.block - noise.frames))
+    short = noise.blocks * noise.block - noise.frames
+    full: Tensor = pad(x, (0, 0, 0, short)) if short else x
     blocks: Tensor = full.unflatten(-2, (noise.blocks, noise.block))
     return blocks
 

@@ -191,15 +191,17 @@ class _LeftOut:
         for fold in folds.unique():
             parameters = self.fit.parameters[folds != fold]
             population = estimate(parameters, self.fit.uncertainty, shares, self.floor)
-            score += self._density(population.scaled(scales), folds == fold, information)
+            score += self._density(population, folds == fold, information, scales)
         return score
 
-    def _density(self, population: Population, rows: Tensor, information: float) -> float:
+    def _density(
+        self, population: Population, rows: Tensor, information: float, scales: Tensor
+    ) -> float:
         a, b = _likelihood(self.early.of_movements(rows), self.fit.noise)
         whole_a, whole_b = _likelihood(self.whole.of_movements(rows), self.fit.noise)
         known = (information * a, information * b)
         later = (whole_a - a + known[0], whole_b - b + known[1])
-        both, first = (population.log_evidence(*part).logsumexp(0) for part in (later, known))
+        both, first = (population.log_evidences(scales, *p).logsumexp(0) for p in (later, known))
         return float((both - first).sum())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -77,5 +78,5 @@ def _sum(terms: Sequence[Term]) -> tuple[Tensor, Tensor, Draw]:
         parts = [(d @ p.sample(count)[..., None])[..., 0].mT for d, p in terms]
         return torch.stack(parts).sum(0)
 
-    mean, variance = (torch.stack(m).sum(0) for m in zip(*moments, strict=True))
+    mean, variance = (reduce(torch.add, m) for m in zip(*moments, strict=True))
     return mean, variance, draw

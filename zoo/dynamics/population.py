@@ -11,6 +11,7 @@ the same form, exactly.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -60,10 +61,18 @@ class Population:
         shared = (solved.shared_linear * solved.shared_mean).sum(-1) / 2
         return at_mean + private + shared - solved.log_volume
 
-    def scaled(self, scale: Float[Tensor, " scale"]) -> Population:
-        """The populations with s times the deviations, for every s along a first axis."""
-        s = scale[:, None, None, None, None]
-        return Population(self.mean, s * self.factors, s * self.private)
+    def log_evidences(
+        self,
+        scales: Float[Tensor, " scale"],
+        precision: Float[Tensor, "#sequence #channel parameter parameter"],
+        linear: Float[Tensor, "sequence channel parameter"],
+    ) -> Float[Tensor, "scale sequence"]:
+        """Those of the populations with s times the deviations, for every s."""
+        if len(precision) > 1 or len(scales) == 1:
+            s = scales[:, None, None, None, None]
+            each = Population(self.mean, s * self.factors, s * self.private)
+            return each.log_evidence(precision, linear)
+        return _evidence_of_scales(self, scales, precision[0], linear)
 
     def shared_posterior(
         self,
@@ -96,12 +105,13 @@ class Population:
 
     def moments(
         self, design: Float[Tensor, "*channel time parameter"]
-    ) -> tuple[Float[Tensor, "sequence time channel"], Float[Tensor, "sequence time channel"]]:
+    ) -> tuple[Float[Tensor, "sequence time channel"], Float[Tensor, "*#sequence time channel"]]:
         """Mean and variance of design θ_c at every time."""
         root = torch.cat([self.factors, self.private], dim=-1)
+        if self.factors.shape[-1]:
+            root = torch.linalg.qr(root.mT, mode="r")[1].mT
         spread = torch.linalg.vector_norm(design @ root, dim=-1).square()
-        mean = self.path(design)
-        return mean.mT, spread.expand_as(mean).mT
+        return self.path(design).mT, spread.mT
 
     def path(
         self, design: Float[Tensor, "*channel time parameter"]
@@ -193,7 +203,7 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
     informed = (precision @ kept).flatten(-3, -2)
     shared = shared_eye + factors.flatten(-3, -2).mT @ informed
     shared_root = torch.linalg.cholesky((shared + shared.mT) / 2)
-    shared_linear = (error.flatten(-2)[..., None, :] @ kept.flatten(-3, -2))[..., 0, :]
+    shared_linear = _across(kept.flatten(-3, -2).mT, error.flatten(-2))
     log_volume = root.diagonal(dim1=-2, dim2=-1).log().sum((-1, -2))
     return _Solved(
         error=error,
@@ -202,10 +212,35 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
         private=private,
         shared_root=shared_root,
         shared_linear=shared_linear,
-        shared_mean=torch.cholesky_solve(shared_linear[..., None], shared_root)[..., 0],
+        shared_mean=_across(shared_root, shared_linear, torch.cholesky_solve),
         log_volume=log_volume + shared_root.diagonal(dim1=-2, dim2=-1).log().sum(-1),
         eye=shared_eye,
     )
+
+
+def _evidence_of_scales(
+    prior: Population, scales: Tensor, precision: Tensor, linear: Tensor
+) -> Float[Tensor, "scale sequence"]:
+    """Log evidences with VᵀAV = U D Uᵀ, so that s acts on D alone."""
+    v, rank = prior.private, prior.factors.shape[-1]
+    eye = torch.eye(rank, dtype=v.dtype, device=v.device)
+    values, turned = torch.linalg.eigh(v.mT @ precision @ v)
+    d, basis = values.clamp_min(0).flatten(), v @ turned
+    factors = torch.linalg.solve(basis, prior.factors).flatten(0, 1)
+    error = linear - _times(precision, prior.mean)
+    white = _times(basis.mT, error).flatten(-2)
+    found = []
+    for s in scales:
+        wide = 1 + s.square() * d
+        shared = eye + factors.mT @ (factors * (s.square() * d / wide)[:, None])
+        root = torch.linalg.cholesky(shared)
+        told = factors.mT @ (s * white / wide).mT
+        pull = torch.linalg.solve_triangular(root, told, upper=False)
+        private = (s * white).square() @ (1 / wide)
+        volume = wide.log().sum() / 2 + root.diagonal().log().sum()
+        found.append((private + pull.square().sum(0)) / 2 - volume)
+    at_mean = (prior.mean * (linear + error)).sum((-1, -2)) / 2
+    return at_mean + torch.stack(found)
 
 
 def _times(
@@ -213,8 +248,23 @@ def _times(
 ) -> Float[Tensor, "*rows channel p"]:
     if matrix.ndim == 3:
         return torch.einsum("cpq,...cq->...cp", matrix, vector)
-    product: Tensor = matrix @ vector[..., None]
-    return product[..., 0]
+    if matrix.shape[-4] > 1 or vector.ndim < 3:
+        product: Tensor = matrix @ vector[..., None]
+        return product[..., 0]
+    columns: Tensor = matrix.squeeze(-4) @ vector.movedim(-3, -1)
+    return columns.movedim(-1, -3)
+
+
+def _across(
+    matrix: Float[Tensor, "*#sequence p q"],
+    vector: Float[Tensor, "*batch q"],
+    solve: Callable[[Tensor, Tensor], Tensor] = lambda b, a: a @ b,
+) -> Float[Tensor, "*rows p"]:
+    """Matrix times vector; a matrix of all movements takes their vectors as columns."""
+    if vector.ndim == 1 or (matrix.ndim > 2 and matrix.shape[-3] > 1):
+        return solve(vector[..., None], matrix)[..., 0]
+    shared = matrix.squeeze(-3) if matrix.ndim > 2 else matrix
+    return solve(vector.mT, shared).mT
 
 
 def _root(covariance: Float[Tensor, "*c p p"]) -> Float[Tensor, "*c p p"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -18,6 +18,7 @@ __all__ = [
     "Movements",
     "Sight",
     "Sums",
+    "in_parts",
     "of_weights",
     "sights",
     "square_after",
@@ -26,7 +27,7 @@ __all__ = [
 ]
 
 Movements = list[tuple[Tensor, Tensor]]
-COLUMNS = 1000
+COLUMNS = 500
 SEQUENCE, CHANNEL = (-4, -3, -2, -2, -2), (-3, -2, -1, -1, -1)
 
 
@@ -148,11 +149,21 @@ def sights(
 
     def smoother(unit: float) -> Smoother:
         noise = PathNoise(primitive.system(Timing(unit)), frames)
-        found = Smoother.of(noise, ratios, known)
+        if bool(known.all()):
+            found = _complete(noise, tuple(ratios.flatten().tolist()), ratios.shape)
+        else:
+            found = Smoother.of(noise, ratios, known)
         return found if index is None else found.at(index)
 
     shared = {unit: smoother(unit) for unit in {t.unit for t in timings}}
     return [Sight(shared[t.unit], roll_out(primitive, frames, t)) for t in timings]
+
+
+@lru_cache(maxsize=8)
+def _complete(noise: PathNoise, ratios: tuple[float, ...], shape: torch.Size) -> Smoother:
+    """The smoother of movements without gaps, which are all alike."""
+    ratio = torch.tensor(ratios, dtype=torch.float64).view(shape)
+    return Smoother.of(noise, ratio, torch.ones(shape[-1], noise.frames, dtype=torch.bool))
 
 
 def sums_of(
@@ -169,14 +180,21 @@ def sums_of(
         (view,) = sights(primitive, [timings[rows[0]]], ratio, seen)
         frames, begun = len(seen), max(2, len(seen) // 4)
         x = torch.stack([movements[i][0] for i in rows]) * seen
-        found = []
-        for part in x.split(max(1, COLUMNS // x.shape[2])):
-            errors, n = view.errors(part), len(part)
-            found.append((view.sums(errors, n, frames), view.sums(errors, n, begun)))
-        parts.append([_joined(each) for each in zip(*found, strict=True)])
+        parts.append(in_parts(x, [(view, frames), (view, begun)]))
     back = torch.tensor(order).argsort()
     whole, early = (_together(each, back) for each in zip(*parts, strict=True))
     return whole, early
+
+
+def in_parts(
+    x: Float[Tensor, "sequence time channel"], asked: Sequence[tuple[Sight, int]]
+) -> list[Sums]:
+    """What the first frames of movements say at timings of one tempo, some movements at a time."""
+    found = []
+    for part in x.split(max(1, COLUMNS // x.shape[2])):
+        errors = asked[0][0].errors(part)
+        found.append([view.sums(errors, len(part), frames) for view, frames in asked])
+    return [_joined(each) for each in zip(*found, strict=True)]
 
 
 def squares(

@@ -29,6 +29,9 @@ def anchors(
     timing: Timing,
 ) -> Float[Tensor, "channel 3"]:
     """y₁, ẏ₁ and g of a movement: its first seen frames and its last, or its mean if rhythmic."""
+    if len(x) > 1 and bool(seen.all()):
+        goal = x[-1] if primitive.kind == "discrete" else x.mean(0)
+        return torch.stack([x[0], (x[1] - x[0]) * timing.unit, goal], dim=1)
     order = torch.arange(len(x))[:, None].expand_as(seen)
     first = order.where(seen, len(x) - 1).amin(0)
     second = order.where(seen & (order > first), len(x)).amin(0)

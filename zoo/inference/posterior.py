@@ -30,7 +30,10 @@ def seeded(seed: int, device: torch.device | str = "cpu") -> Iterator[None]:
     kind = torch.device(device)
     devices = [] if kind.type == "cpu" else [kind]
     with torch.random.fork_rng(devices=devices):
-        torch.manual_seed(seed)
+        if devices:
+            torch.manual_seed(seed)
+        else:
+            torch.default_generator.manual_seed(seed)
         yield
 
 

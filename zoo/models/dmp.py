@@ -219,7 +219,7 @@ class DMP(LearnedDmp):
         return Predictive(
             location=parts.mean,
             noise=noise,
-            epistemic=parts.variance.sqrt(),
+            epistemic=parts.variance.sqrt().expand_as(parts.mean),
             draws=parts.draws(draws),
         )
 

@@ -278,7 +278,7 @@ def _predictive(parts: Components, noise: Tensor | None, draws: int) -> Predicti
     return Predictive(
         location=parts.mean,
         noise=noise,
-        epistemic=parts.variance.sqrt(),
+        epistemic=parts.variance.sqrt().expand_as(parts.mean),
         draws=parts.draws(draws),
     )
 

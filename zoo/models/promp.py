@@ -308,6 +308,6 @@ class ProMP(nn.Module):
         return Predictive(
             location=self.offset + parts.mean,
             noise=self.noise.expand_as(parts.mean),
-            epistemic=parts.variance.sqrt(),
+            epistemic=parts.variance.sqrt().expand_as(parts.mean),
             draws=paths.map(lambda y: self.offset + y, paths.shape),
         )
