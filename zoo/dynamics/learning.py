@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,10 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from zoo.dynamics.communality import blocks, unshared
 from zoo.dynamics.evidence import FLOOR, conjugate_weights
 from zoo.dynamics.imitation import locally_weighted_regression, target_force
 from zoo.dynamics.population import Population, Shares, estimate
-from zoo.dynamics.rollout import Primitive, Timing
+from zoo.dynamics.rollout import Primitive, Timing, roll_out
 from zoo.dynamics.scales import student_scales
 from zoo.dynamics.sums import Movements, Sums, of_weights, square_after, sums_of
 from zoo.dynamics.timing import anchors, timings_of
@@ -20,14 +22,13 @@ from zoo.dynamics.timing import anchors, timings_of
 __all__ = ["Learned", "Learning", "learn"]
 
 RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
-SHARES = tuple(
-    Shares(alone, part) for alone in (0.02, 0.1, 0.3, 0.6, 1.0) for part in (0.0, 0.3, 1.0)
-)
+INDEPENDENT = (0.0, 0.3, 1.0)
 SCALES = {"discrete": 16, "rhythmic": 8}
 FEW = Shares(0.5, 0.5)
 LOW = 0.1
 INFORMATION = (1.0, 0.3, 0.1, 0.03, 0.01)
 FOLDS = 5
+PLACES = 25
 NOISE_OF = {"path": 100.0, "force": 1e-4}
 
 Learning = Literal["path", "force", "lwr"]
@@ -90,7 +91,9 @@ def learn(
         parameters, uncertainty = _weights(every.at(own), starts)
     fit, winner = _residuals(every, ratios, parameters, uncertainty)
     whole, early = every.of_channels(winner), begun.of_channels(winner)
-    shares, information = _chosen(fit, whole, early, floor, scales)
+    shares, information = _chosen(
+        _LeftOut(fit, whole, early, _entries(primitive, movements, timings), floor)
+    )
     population = estimate(fit.parameters, fit.uncertainty, shares, floor)
     if not all(bool(seen.all()) for _, seen in movements):
         population = _refined(population, whole, fit.noise, shares, floor)
@@ -159,20 +162,52 @@ def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
     return floor
 
 
-def _chosen(
-    fit: _Fit, whole: Sums, early: Sums, floor: Tensor, scales: Tensor
-) -> tuple[Shares, float]:
-    """Shares, and then information, that make movements left out most probable.
+def _chosen(left_out: _LeftOut) -> tuple[Shares, float]:
+    """Shares, and then information, under which entries of movements left out are most probable.
 
-    Shares are compared at a low information: at 1 they would make up for residuals that go together
-    over channels and time, which are no matter of movements' parameters.
+    What a channel has alone is what the others cannot tell of it. Shares are compared at a low
+    information: at 1 they would make up for residuals that go together over channels and time,
+    which are no matter of movements' parameters.
     """
-    if len(fit.parameters) < 3:
+    parameters = left_out.fit.parameters
+    if len(parameters) < 3:
         return FEW, 1.0
-    left_out = _LeftOut(fit, whole, early, floor)
-    usual = torch.ones_like(scales[:1])
-    shares = max(SHARES, key=lambda s: left_out.density(s, LOW, usual))
-    return shares, max(INFORMATION, key=lambda c: left_out.density(shares, c, scales))
+    alone = unshared(parameters)
+    every = [Shares(alone, part) for part in INDEPENDENT]
+    shares = max(every, key=lambda s: left_out.density(s, LOW))
+    return shares, max(INFORMATION, key=lambda c: left_out.density(shares, c))
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Some entries of every movement, which of them are after its first quarter, and R there."""
+
+    x: Float[Tensor, "sequence place channel"]
+    seen: Bool[Tensor, "sequence place channel"]
+    late: Bool[Tensor, "sequence place 1"]
+    design: Float[Tensor, "sequence place parameter"]
+
+    def errors(self, mean: Float[Tensor, "sequence channel parameter"]) -> Tensor:
+        """x − R θ."""
+        return self.x - self.design @ mean.mT
+
+    def of_movements(self, rows: Bool[Tensor, " sequence"]) -> _Entries:
+        """Those of some movements."""
+        return _Entries(self.x[rows], self.seen[rows], self.late[rows], self.design[rows])
+
+
+def _entries(primitive: Primitive, movements: Movements, timings: list[Timing]) -> _Entries:
+    """Entries of ``PLACES`` frames evenly spaced."""
+    designs: dict[tuple[int, Timing], Tensor] = {}
+    rows = []
+    for (x, seen), timing in zip(movements, timings, strict=True):
+        frames = len(x)
+        at = torch.linspace(0, frames - 1, PLACES).round().long()
+        if (frames, timing) not in designs:
+            designs[frames, timing] = roll_out(primitive, frames, timing)[at]
+        late = (at >= max(2, frames // 4))[:, None]
+        rows.append((x[at], seen[at], late, designs[frames, timing]))
+    return _Entries(*(torch.stack(part) for part in zip(*rows, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -182,27 +217,60 @@ class _LeftOut:
     fit: _Fit
     whole: Sums
     early: Sums
+    entries: _Entries
     floor: Tensor
 
-    def density(self, shares: Shares, information: float, scales: Tensor) -> float:
-        """Log density of the later three quarters of movements left out, given their first."""
-        count, score = len(self.fit.parameters), 0.0
-        folds = torch.arange(count) % min(FOLDS, count)
-        for fold in folds.unique():
-            parameters = self.fit.parameters[folds != fold]
-            population = estimate(parameters, self.fit.uncertainty, shares, self.floor)
-            score += self._density(population, folds == fold, information, scales)
-        return score
+    def density(self, shares: Shares, information: float) -> float:
+        """Mean log density of single entries left out, to two questions that count alike.
 
-    def _density(
-        self, population: Population, rows: Tensor, information: float, scales: Tensor
-    ) -> float:
-        a, b = _likelihood(self.early.of_movements(rows), self.fit.noise)
-        whole_a, whole_b = _likelihood(self.whole.of_movements(rows), self.fit.noise)
-        known = (information * a, information * b)
-        later = (whole_a - a + known[0], whole_b - b + known[1])
-        both, first = (population.log_evidences(scales, *p).logsumexp(0) for p in (later, known))
-        return float((both - first).sum())
+        The later three quarters are given the first; a block of channels, another in every fold, is
+        given the others. Of single entries: jointly, thousands would count as independent.
+        """
+        e, found = self.entries, []
+        count = e.seen.sum((0, 1)).clamp_min(1)
+        rest = (e.errors(self.fit.parameters).square() * e.seen).sum((0, 1)) / count
+        rest = rest.clamp_min(FLOOR)
+        block = blocks(len(rest))
+        for fold, rows, population in self._folds(shares):
+            a, b, whole_a, whole_b = self._likelihoods(rows)
+            hidden = block == fold % (block.max() + 1)
+            known = information * (~hidden).to(b)
+            later = population.condition(information * a, information * b)
+            filled = population.condition(known[:, None, None] * whole_a, known[:, None] * whole_b)
+            here = e.of_movements(rows)
+            found.append(_of_entries(later, here, here.late, rest))
+            found.append(_of_entries(filled, here, hidden[None, None], rest))
+        return float(torch.stack(found).unflatten(0, (-1, 2)).nanmean(0).nansum())
+
+    def _folds(self, shares: Shares) -> Iterator[tuple[int, Tensor, Population]]:
+        """Every fold, its movements, and the population of the others."""
+        parameters = self.fit.parameters
+        folds = torch.arange(len(parameters)) % min(FOLDS, len(parameters))
+        for fold in range(int(folds.max()) + 1):
+            others = parameters[folds != fold]
+            yield fold, folds == fold, estimate(others, self.fit.uncertainty, shares, self.floor)
+
+    def _likelihoods(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of the first quarter, and of all."""
+        parts = (self.early.of_movements(rows), self.whole.of_movements(rows))
+        (a, b), (whole_a, whole_b) = (_likelihood(part, self.fit.noise) for part in parts)
+        return a, b, whole_a, whole_b
+
+
+def _of_entries(
+    population: Population,
+    entries: _Entries,
+    asked: Bool[Tensor, "#sequence #place #channel"],
+    rest: Float[Tensor, " channel"],
+) -> Tensor:
+    """Mean log density of the entries asked, up to a constant; NaN where none was seen."""
+    root = torch.cat([population.factors, population.private], dim=-1)
+    alike = bool((entries.design == entries.design[0]).all())
+    design = entries.design[:1] if alike else entries.design
+    spread = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
+    variance = spread + rest
+    density = -(entries.errors(population.mean).square() / variance + variance.log()) / 2
+    return density[entries.seen & asked].mean()
 
 
 def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:

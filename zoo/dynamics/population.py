@@ -134,13 +134,13 @@ class Population:
 
 @dataclass(frozen=True)
 class Shares:
-    """What of the covariance over movements every channel has alone, and of that every parameter.
+    """What of its covariance over movements each channel has alone, and of that every parameter.
 
     The sample covariance of n movements has rank n − 1: under it alone a few frames would settle
     the rest of the movement.
     """
 
-    alone: float
+    alone: Float[Tensor, " channel"] | float
     independent: float
 
 
@@ -168,8 +168,9 @@ def estimate(
     scaled = deviation / size.sqrt()[:, None]
     shape = torch.einsum("scp,scq->pq", scaled, scaled) / channels
     shape = torch.lerp(shape, torch.diag(shape.diagonal()), shares.independent)
-    private = private + shares.alone * size[:, None, None] * shape
-    factors = (1 - shares.alone) ** 0.5 * deviation.permute(1, 2, 0)
+    alone = torch.as_tensor(shares.alone, dtype=mean.dtype).view(-1, 1, 1)
+    private = private + alone * size[:, None, None] * shape
+    factors = (1 - alone).sqrt() * deviation.permute(1, 2, 0)
     return Population(mean, factors, _root(private))
 
 

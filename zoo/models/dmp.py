@@ -53,9 +53,12 @@ class DMP(LearnedDmp):
     The program counts every entry as ``information`` of an independent one, since residuals go
     together over joints and time: below 1 its posterior is a generalised (tempered) one, not Bayes'
     (Bissiri, Holmes & Walker, *A general framework for updating belief distributions*, JRSS B 78,
-    2016). Information, the share of V, and the share of independent parameters in it are those
-    under which movements left out are most probable after their first quarter; with fewer than
-    three movements information is 1. Timings and noise are learned from all movements before.
+    2016). What a channel has in V and not in L is the share that a ridge on the other channels
+    cannot tell of movements left out. Information and the share of independent parameters in V are
+    those under which single entries of movements left out are most probable, later ones after the
+    first quarter and those of a block of channels given the others; with fewer than three movements
+    information is 1 and the shares are one half. Timings, noise and that share of a channel are
+    learned from all movements before.
 
     Forecasts and filled gaps are the posterior predictive, at durations of training movements that
     last as long, resampled to 16 components. A reconstruction, and a demonstration that is to be
