@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import gc
 import hashlib
 import json
+import multiprocessing
 import os
+import platform
 import queue
 import re
 import shutil
@@ -24,15 +27,28 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 STORED = ROOT / "results" / "mutants.json"
 SUITE = ("tests/truth", "tests/contract", "tests/data", "tests/faces", "tests/house")
 SOURCES = ("zoo", "guides", "datasets", "tests", "docs")
 NAMED_SECONDS, SUITE_SECONDS = 900.0, 7200.0
-RED, GREEN = 1, 0
+RED, GREEN, FOREIGN = 1, 0, 99
+# libraries are imported once, in a server; every run of tests is a fork of it
+LIBRARIES = (
+    "torch torch._dynamo torch.distributed.tensor pyro pyro.infer gpytorch numpy scipy.stats"
+    " scipy.signal sklearn.linear_model scoringrules xarray pydantic safetensors.torch jaxtyping"
+    " beartype matplotlib.pyplot IPython rich typer pytest hypothesis nbmake.pytest_items"
+    " pytest_benchmark.plugin"
+)
+PYTEST = ("-x", "-q", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+FORKED = multiprocessing.get_context("forkserver")
+FORKED.set_forkserver_preload(LIBRARIES.split())
 
 
 class StaleListError(ValueError):
@@ -121,24 +137,43 @@ def copied(folder: Path) -> Path:
 
 def run(tree: Path, tests: Sequence[str], seconds: float) -> tuple[int, str]:
     """Exit status of pytest in ``tree``, and the first test that is red."""
-    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
-    try:
-        done = subprocess.run(
-            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=seconds
-        )
-    except subprocess.TimeoutExpired:
+    told = tree / "told.txt"
+    child = FORKED.Process(target=_tested, args=(str(tree), tuple(tests), str(told)))
+    child.start()
+    child.join(seconds)
+    if child.exitcode is None:
+        child.kill()
+        child.join()
         return RED, f"no end after {seconds:.0f} s"
-    first = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    if done.returncode not in (GREEN, RED, 2) or (done.returncode and first is None):
-        raise StaleListError(f"pytest could not run {tests}:\n{done.stdout}{done.stderr}"[-2000:])
-    return (RED if done.returncode else GREEN), first[1] if first else ""
+    text = told.read_text(encoding="utf-8")
+    first = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE)
+    if child.exitcode not in (GREEN, RED, 2) or (child.exitcode and first is None):
+        raise StaleListError(f"pytest could not run {tests}:\n{text[-2000:]}")
+    return (RED if child.exitcode else GREEN), first[1] if first else ""
+
+
+def _tested(tree: str, tests: Sequence[str], told: str) -> None:
+    """Run pytest in ``tree``, whose package is imported and no other, and end the process."""
+    with open(told, "w") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    os.chdir(tree)
+    sys.path[:] = [tree, *(p for p in sys.path if Path(p) not in (ROOT, ROOT / "tests"))]
+    os.environ["PYTHONPATH"] = tree
+    sys.dont_write_bytecode = False
+    gc.freeze()
+    status = int(pytest.main([*PYTEST, *tests]))
+    home = getattr(sys.modules.get("zoo"), "__file__", tree)
+    if not Path(home).is_relative_to(tree):
+        print(f"it is {home} that was tested")
+        sys.exit(FOREIGN)
+    sys.exit(status)
 
 
 def outcome(mutation: Mutation, tree: Path) -> dict[str, Any]:
     """Whether a test turns red, which, and after how many seconds."""
     path, began = tree / mutation.file, time.monotonic()
-    whole = path.read_text(encoding="utf-8")
+    whole, before = path.read_text(encoding="utf-8"), path.stat()
     path.write_text(mutation.applied(whole), encoding="utf-8")
     try:
         status, test = run(tree, mutation.tests, NAMED_SECONDS)
@@ -146,6 +181,7 @@ def outcome(mutation: Mutation, tree: Path) -> dict[str, Any]:
             status, test = run(tree, SUITE, SUITE_SECONDS)
     finally:
         path.write_text(whole, encoding="utf-8")
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     return {
         "name": mutation.name,
         "file": mutation.file,
@@ -192,12 +228,18 @@ def stored() -> dict[str, dict[str, Any]]:
 
 def store(rows: Sequence[dict[str, Any]]) -> str:
     """Write what was found; returns it as a line."""
+    from zoo.experiments.result import commit
+
     killed = sum(row["outcome"] == "killed" for row in rows)
     share = 100 * killed / max(1, len(rows))
     payload = {
         "name": "mutants",
         "label": "own",
         "command": "make mutants",
+        "seconds": round(sum(row["seconds"] for row in rows), 1),
+        "versions": {n: version(n) for n in ("movezoo", "torch", "pyro-ppl", "numpy", "pytest")},
+        "commit": commit(),
+        "machine": {"cores": os.cpu_count(), "python": platform.python_version()},
         "mutations": len(rows),
         "killed": killed,
         "share": round(share, 1),
@@ -225,6 +267,7 @@ def main() -> None:
     print(f"{len(chosen)} mutations fit the code")
     if told.list:
         return
+    os.environ["OMP_NUM_THREADS"] = "1"
     code = state_of_the_code()
     keys = {m.name: key(m, code) for m in everything}
     known = {n: row for n, row in stored().items() if row["key"] == keys.get(n)}
