@@ -34,6 +34,7 @@ from zoo.guides.exact import ExactPosterior
 from zoo.inference.loader import whole
 from zoo.inference.posterior import seeded
 from zoo.models.dmp import DMP, Config
+from zoo.types import Wishes
 
 SYSTEM = Transformation(dt=1 / 59)
 FRAMES, CHANNELS = 30, 2
