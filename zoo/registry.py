@@ -73,6 +73,8 @@ class Registry:
 
     def __getitem__(self, name: str) -> Entry:
         """The entry of that name; an unknown name lists the nearest ones."""
+        if not isinstance(name, str):
+            raise TypeError(f"a model is named by text, such as 'vae-dmp'; got {name!r}")
         if name not in self._entries:
             near = difflib.get_close_matches(name, self._entries, n=3, cutoff=0.4)
             hint = f"; did you mean {' or '.join(near)}?" if near else ""

@@ -11,17 +11,18 @@ import torch
 from numpy.typing import ArrayLike
 from torch import nn
 
+from zoo.arguments import whole_number
 from zoo.assembly import Assembly, create
-from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.datasets.scaling import Scaler
 from zoo.errors import NotCapableError
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
 from zoo.exchange import Answer, Exchange, check_timing, check_unseen, fingerprints, question
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.prediction import Prediction, Predictive, Recalibration
 from zoo.questions import Setup
+from zoo.streams import seeded
 from zoo.tasks import Method, Trained, corrections, posed
 from zoo.types import Batch, Posterior
 
@@ -80,8 +81,10 @@ class Run:
         self, data: Sequences, *, horizon: int, draws: int = 200, seed: int = 0
     ) -> Prediction:
         """The ``horizon`` frames after the movements in ``data``, which hold the frames seen."""
-        if horizon < 1:
-            raise ValueError(f"horizon must be at least 1 frame; got {horizon}")
+        horizon, draws = (
+            whole_number(horizon, "horizon", unit="frame"),
+            whole_number(draws, "draws"),
+        )
         forecast = self._capability("forecast")
 
         def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
@@ -100,7 +103,7 @@ class Run:
 
     def represent(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
         """Latent trajectories of the movements."""
-        represent = self._capability("represent")
+        represent, draws = self._capability("represent"), whole_number(draws, "draws")
 
         def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
             return represent(batch, posterior, draws=draws)
@@ -121,6 +124,7 @@ class Run:
         """Targets of new inputs, given as Pairs or as an array (item, feature)."""
         regress = self._capability("regress")
         pairs = self.exchange.scaled(self.exchange.pairs(data))
+        draws = whole_number(draws, "draws")
         with seeded(seed, self.assembly.device), torch.no_grad():
             predictive = regress(pairs.inputs, draws=draws)
         layout = self.assembly.layout
@@ -152,7 +156,8 @@ class Run:
         ``onto`` are the movements to switch to, one for all or one for each, from frame ``start``
         of the new movement over ``steps`` frames, (89).
         """
-        generate = self._capability("generate")
+        generate, draws = self._capability("generate"), whole_number(draws, "draws")
+        check_record(like, "generate")
         check_timing(like, duration, onto is not None, start, steps)
         target = None if goal is None else self.exchange.goal(goal, len(like))
         other = None if onto is None else self.exchange.onto(onto, len(like))
@@ -183,6 +188,7 @@ class Run:
 
         ``setup`` says how the tasks will be posed, such as which channels will be missing.
         """
+        check_record(data, "calibrate")
         check_unseen(data, self.trained_on["fingerprints"], "calibration")
         self.recalibrations.update(corrections(self, data, method, tasks, setup))
         self.calibrated_on = [*self.calibrated_on, *fingerprints(data)]
@@ -216,7 +222,7 @@ class Run:
         return method
 
     def _simple(self, task: Any, data: Sequences, draws: int, seed: int) -> Prediction:
-        method = self._capability(task)
+        method, draws = self._capability(task), whole_number(draws, "draws")
 
         def answer(batch: Batch, posterior: Posterior | None, rows: list[int]) -> Predictive:
             return method(batch, posterior, draws=draws)
@@ -250,6 +256,9 @@ def evaluate(
 
     A task without an answer on these data is a line that says why; the others are scored.
     """
+    if not hasattr(run, "trained_on"):
+        raise TypeError(f"evaluate scores a run, which zoo.fit gives; got {type(run).__name__}")
+    check_record(data, "evaluate")
     check_unseen(data, run.trained_on["fingerprints"], "evaluation")
     check_unseen(data, run.calibrated_on, "evaluation", "calibrated on")
     found, refused = posed(run, data, tasks, setup)

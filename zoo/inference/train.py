@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from zoo.datasets.records import Pairs, Sequences
 from zoo.inference.loader import whole
 from zoo.inference.marginal import fit_marginal
-from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
 from zoo.strategies import Exact, Inference, MarginalLikelihood, Svi
+from zoo.streams import alone, seeded
 from zoo.types import Batch, Posterior
 
 __all__ = [
@@ -179,7 +180,8 @@ def _exact(
     model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
 ) -> list[dict[str, Any]]:
     _need(model, Conditions)
-    model.condition(train)
+    with alone():
+        model.condition(train)
     return []
 
 
