@@ -26,7 +26,6 @@ from zoo.evaluation.scores import score
 from zoo.experiments.process_noise import NoiseShare, noise_share
 from zoo.experiments.result import Result, write_result
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.inference.train import kept_out
 from zoo.leaderboard.protocols import protocol
 from zoo.models import ae_dmp
@@ -35,6 +34,7 @@ from zoo.models.pca import Config as PcaConfig
 from zoo.models.vae_dmp import VaeDmp
 from zoo.prediction import Prediction
 from zoo.run import Run
+from zoo.streams import seeded
 from zoo.tasks import answered
 from zoo.types import Batch, Layout, Posterior
 

@@ -99,8 +99,8 @@ def common_rate(
     ]
     if given is None and not told:
         raise ValueError(
-            "rate is needed, in Hz (rate=120.0): the data have no times, such as a column or "
-            "coordinate named time, in s"
+            "rate is needed, in Hz (rate=120.0, or --rate 120 on the command line): the data have "
+            "no times, such as a column or coordinate named time, in s"
         )
     common, _, source = max(told, key=lambda t: t[1]) if given is None else (given, 0, "")
     for found, intervals, name in told:

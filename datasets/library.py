@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from zoo.datasets.split import nearest
+from zoo.datasets.tables import is_file
 from zoo.errors import UnknownNameError
 
-__all__ = ["list_data", "load_data"]
+__all__ = ["list_data", "load_data", "means_file"]
 
+FILES = "zoo.datasets.tables:load"
 LOADERS = {
     "robot-arm": "zoo.datasets.robot_arm:load",
     "robot-arm/held-out": "zoo.datasets.robot_arm:load_held_out",
@@ -51,11 +53,13 @@ def list_data() -> list[str]:
     return [*LOADERS, *members]
 
 
-def load_data(name: str, *, folder: str | Path | None = None, **options: object) -> Any:
-    """The data set of that name as ``Sequences`` or ``Pairs``.
+def load_data(name: str | Path, *, folder: str | Path | None = None, **options: object) -> Any:
+    """The data set of that name, or the movements in a file, as ``Sequences`` or ``Pairs``.
 
-    ``folder`` holds the files; without it ``$MOVEZOO_DATA`` does. ``options`` are those of the
-    data set's own loader; an option it does not know is refused.
+    A name that ends in .csv, .tsv, .txt, .npz or .parquet is a file of one's own, and a folder of
+    such files holds movements too: see :func:`zoo.datasets.tables.load`. ``folder`` holds the
+    files of a data set; without it ``$MOVEZOO_DATA`` does. ``options`` are those of the data set's
+    own loader; an option it does not know is refused.
 
     >>> data = load_data("robot-arm/reaching", movements=3)
     >>> len(data), data.name
@@ -76,12 +80,30 @@ def load_data(name: str, *, folder: str | Path | None = None, **options: object)
     return loader(*arguments, **options)
 
 
-def _loader(name: str) -> tuple[Callable[..., Any], tuple[str, ...]]:
+def means_file(name: str) -> bool:
+    """Whether :func:`load_data` takes a name for a file or folder of one's own.
+
+    >>> means_file("walk.csv"), means_file("robot-arm")
+    (True, False)
+    """
+    return name not in LOADERS and name.partition("/")[0] not in FAMILIES and is_file(name)
+
+
+def _loader(name: str | Path) -> tuple[Callable[..., Any], tuple[str, ...]]:
+    if not isinstance(name, str | Path):
+        raise TypeError(
+            f"load_data takes the name of a data set or a file; got {type(name).__name__}: arrays "
+            "become a record by zoo.Sequences.from_arrays"
+        )
+    if isinstance(name, Path):
+        return _imported(FILES), (str(name),)
     if name in LOADERS:
         return _imported(LOADERS[name]), ()
     family, _, member = name.partition("/")
     if family in FAMILIES and member:
         return _imported(FAMILIES[family].loader), (member,)
+    if means_file(name):
+        return _imported(FILES), (name,)
     raise UnknownNameError(f"no data set {name!r}{nearest(name, list_data())}")
 
 

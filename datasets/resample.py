@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from zoo.arguments import whole_number
 from zoo.datasets.checks import stacked
+from zoo.datasets.clock import checked_rate
 
 __all__ = ["Grid", "resample", "resample_movements"]
 
@@ -81,12 +83,10 @@ def _times(data: Movements, frames: int | None, rate: float | None) -> list[Tens
     if min(last) < 1:
         raise ValueError(f"sequence {last.index(min(last))} has 1 frame; 2 are needed to resample")
     if rate is not None:
-        if not rate > 0:
-            raise ValueError(f"rate must be positive, in Hz; got {rate}")
+        rate = checked_rate(rate)
         step = data.rate / rate
         return [torch.arange(int(n / step + _SMALL) + 1, dtype=torch.float64) * step for n in last]
-    if frames is None or frames < 2:
-        raise ValueError(f"frames must be at least 2; got {frames}")
+    frames = whole_number(frames, "frames", 2)
     return [torch.linspace(0, n, frames, dtype=torch.float64) for n in last]
 
 

@@ -14,12 +14,13 @@ from torch import Tensor
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import UnlikeUnitsWarning
 
-__all__ = ["Kind", "Scaler"]
+__all__ = ["Kind", "Scaler", "suited"]
 
 Kind = Literal["standard", "center", "range", "none"]
 _Record = TypeVar("_Record", Pairs, Sequences)
 _FLAT = 1e-9
 POOLED = 0.2
+APART = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +112,35 @@ class Scaler:
     def _scaled(self, values: Tensor, mask: Tensor) -> Tensor:
         scaled = (values - self.channel_shift).div_(self.channel_scale)
         return scaled if bool(mask.all()) else scaled.masked_fill_(~mask, 0.0)
+
+
+def suited(data: Pairs | Sequences, kind: Kind) -> Kind:
+    """``kind``, or ``standard`` where ``center`` would divide by one number what has none.
+
+    Channels of several units have none, and channels without a unit whose standard deviations
+    differ by more than a factor of 30. An :class:`~zoo.errors.UnlikeUnitsWarning` says so.
+    """
+    if kind != "center":
+        return kind
+    values, mask = _observed(data)
+    std = _moments(values, mask, data.units, "standard")[0]
+    kinds = list(dict.fromkeys(data.units))
+    apart = float(std.max() / std.min())
+    if len(kinds) > 1:
+        told = f"channels are in {', '.join(u or 'no unit' for u in kinds)}"
+    elif kinds == [""] and apart > APART:
+        told = (
+            f"channels have no unit and standard deviations that differ by a factor of {apart:.3g}"
+        )
+    else:
+        return kind
+    warnings.warn(
+        f"{told}: scaling='standard' is used, where this model takes 'center'; scaling='center' "
+        "says that one scale suits all",
+        UnlikeUnitsWarning,
+        stacklevel=5,
+    )
+    return "standard"
 
 
 def _observed(data: Pairs | Sequences) -> tuple[Tensor, Tensor]:

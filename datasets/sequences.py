@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from zoo.arguments import whole_number
 from zoo.datasets.checks import (
     Groups,
     distinct_names,
@@ -177,7 +178,8 @@ class Sequences:
 
     def frames(self, start: int, stop: int) -> Self:
         """Frames ``start`` to ``stop`` (exclusive) of every movement; all must be long enough."""
-        if not 0 <= start < stop:
+        start, stop = whole_number(start, "start", 0), whole_number(stop, "frames", unit="frame")
+        if not start < stop:
             raise ValueError(f"frames needs 0 <= start < stop; got {start}, {stop}")
         short = int(self.lengths.min())
         if stop > short:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from numbers import Real
 
 import numpy as np
 
+from zoo.arguments import seed_of
 from zoo.errors import UnknownNameError
 
 __all__ = ["matching_rows", "named_columns", "nearest", "split_rows"]
@@ -30,7 +32,7 @@ def split_rows(
     >>> split_rows({"subject": list("aabbcc")}, by="subject", parts=(2, 1), seed=0, count=6)
     [[0, 1, 4, 5], [2, 3]]
     """
-    shares = _shares(parts)
+    shares, seed = _shares(parts), seed_of(seed)
     members = _members(groups, by, count)
     if len(members) < len(shares):
         raise ValueError(
@@ -94,6 +96,9 @@ def nearest(name: str, names: Collection[str]) -> str:
 
 
 def _shares(parts: Sequence[float]) -> list[float]:
+    wanted = isinstance(parts, Iterable) and not isinstance(parts, str)
+    if not wanted or not all(isinstance(p, Real) for p in parts):
+        raise TypeError(f"parts must be a list of shares, such as (0.6, 0.4); got {parts!r}")
     if not parts or any(not (math.isfinite(p) and p > 0) for p in parts):
         raise ValueError(f"parts must be positive shares; got {tuple(parts)}")
     total = math.fsum(parts)
@@ -122,6 +127,8 @@ def _deal(members: list[list[int]], shares: list[float], count: int) -> list[lis
 
 
 def _column(groups: Mapping[str, Sequence[str]], column: str) -> Sequence[str]:
+    if not isinstance(column, str):
+        raise TypeError(f"a group column is named by text; got {column!r}")
     if column not in groups:
         raise UnknownNameError(f"no group column {column!r}{nearest(column, groups)}")
     return groups[column]

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from zoo.arguments import whole_number
+
 __all__ = ["cut"]
 
 
@@ -21,8 +23,7 @@ def cut(
             [0, 1, 2],
             [1, 2, 3]]))
     """
-    if length < 1 or stride < 1:
-        raise ValueError(f"length and stride must be at least 1; got {length}, {stride}")
+    length, stride = whole_number(length, "length"), whole_number(stride, "stride")
     short = int(lengths.argmin())
     if int(lengths[short]) < length:
         raise ValueError(

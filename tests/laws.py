@@ -22,11 +22,12 @@ from torch import Tensor
 from zoo.datasets.records import Pairs, Sequences
 from zoo.inference.elbo import bound
 from zoo.inference.loader import Loader, stream, whole
-from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.posterior import GuidePosterior
 from zoo.prediction import Prediction, Predictive
 from zoo.questions import Setup, hide_joints, hide_section
 from zoo.run import Run
 from zoo.strategies import MarginalLikelihood
+from zoo.streams import seeded
 from zoo.tasks import trials
 from zoo.types import Batch
 

@@ -10,7 +10,8 @@ from typing import Any, Literal, Self
 
 from numpy.typing import ArrayLike
 
-from zoo.datasets.records import Pairs, Sequences
+from zoo.arguments import whole_number
+from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.errors import NotCapableError
 from zoo.exchange import check_unseen, fingerprints, question
 from zoo.prediction import Prediction, Recalibration
@@ -78,10 +79,9 @@ class Answers(ABC):
 
         Raises NotCapableError where the model cannot forecast.
         """
-        if horizon < 1:
-            raise ValueError(f"horizon must be at least 1 frame; got {horizon}")
+        ahead = whole_number(horizon, "horizon", unit="frame")
         return self._answer(
-            Query(task="forecast", data=data, horizon=horizon, draws=draws, seed=seed)
+            Query(task="forecast", data=data, horizon=ahead, draws=draws, seed=seed)
         )
 
     def reconstruct(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
@@ -120,6 +120,7 @@ class Answers(ABC):
         of the new movement over ``steps`` frames, (89).
         """
         self._need("generate")
+        check_record(like, "generate")
         _check_timing(like, duration, onto is not None, start, steps)
         return self._answer(
             Query(
@@ -147,6 +148,7 @@ class Answers(ABC):
 
         ``setup`` says how the tasks will be posed, such as which channels will be missing.
         """
+        check_record(data, "calibrate")
         check_unseen(data, self.fingerprints, "calibration")
         self.recalibrations.update(corrections(self, data, method, tasks, setup))
         self.calibrated_on.extend(fingerprints(data))
@@ -154,6 +156,7 @@ class Answers(ABC):
 
     def _answer(self, query: Query) -> Prediction:
         self._need(query.task)
+        whole_number(query.draws, "draws")
         found = self.uncorrected(query)
         asked = question(query.task, query.data)
         return replace(found, recalibration=self.recalibrations.get(asked))

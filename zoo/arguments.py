@@ -52,7 +52,7 @@ def level_of(level: object) -> float:
         raise TypeError(f"level must be one number between 0 and 1; got {level!r}")
     number = float(number)
     if not 0 < number < 1:
-        meant = f": for {number:g} % write {number / 100:g}" if 1 < number < 100 else ""
+        meant = f": for {number:g} % write {number / 100:g}" if 5 <= number < 100 else ""
         raise ValueError(f"level must be between 0 and 1; got {number:g}{meant}")
     return number
 

@@ -15,13 +15,14 @@ from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
 from zoo import automatic
+from zoo.arguments import seed_of
 from zoo.catalogue import CATALOGUE
-from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.errors import UnknownNameError
 from zoo.inference.elbo import Program
-from zoo.inference.posterior import seeded
 from zoo.registry import Entry, Part, Scaling, load
 from zoo.strategies import Inference, Svi
+from zoo.streams import seeded
 from zoo.types import Batch, Layout
 
 __all__ = ["Assembly", "assemble", "create", "options"]
@@ -120,7 +121,9 @@ def create(
     >>> zoo.create("pca", data, latent_dim=2).model.config.latent_dim
     2
     """
-    return assemble(CATALOGUE[name], data.layout, settings, seed=seed, device=device)
+    entry = CATALOGUE[name]
+    check_record(data, "create")
+    return assemble(entry, data.layout, settings, seed=seed_of(seed), device=device)
 
 
 def assemble(

@@ -7,10 +7,12 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+
+from zoo.options import Data, Figure, Folder, Json, Output, Rate, Seed, Settings, Unseen
 
 __all__ = ["app", "main"]
 
@@ -28,23 +30,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
-Data = Annotated[
-    str | None,
-    typer.Option("--data", help="Data set by name (see `zoo data`); default: the model's own."),
-]
-Unseen = Annotated[
-    str | None,
-    typer.Option("--data", help="Data set by name (see `zoo data`); default: the run's test part."),
-]
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="KEY=VALUE, a setting of the model; repeatable (see `zoo card`)."),
-]
-Folder = Annotated[Path, typer.Argument(help="Folder of a run that `zoo fit` wrote.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of split, parameters and noise.")]
-Figure = Annotated[Path | None, typer.Option("--figure", help="Write a figure to this PNG.")]
 
 
 @app.command("list")
@@ -88,9 +73,10 @@ def card(name: Annotated[str, typer.Argument(help="Name of a model.")], json: Js
 def data(
     name: Annotated[str | None, typer.Argument(help="Name of a data set; none lists all.")] = None,
     folder: Annotated[Path | None, typer.Option(help="Where the files are.")] = None,
+    rate: Rate = None,
     json: Json = False,
 ) -> None:
-    """Data sets by name, or one described: movements, frames, rate, channels, groups."""
+    """Data sets by name, or one or a file described: movements, frames, rate, channels, groups."""
     from zoo.console import data_table, describe, print_json
     from zoo.datasets.library import list_data, load_data
 
@@ -98,7 +84,10 @@ def data(
         names = list_data()
         print_json(names) if json else Console().print(data_table(names))
         return
-    description = describe(load_data(name, folder=folder))
+    given: dict[str, Any] = {
+        k: v for k, v in {"folder": folder, "rate": rate}.items() if v is not None
+    }
+    description = describe(load_data(name, **given))
     print_json(description) if json else Console().print(data_table(description))
 
 
@@ -114,26 +103,33 @@ def fit(
     calibrate: Annotated[str, typer.Option(help="conformal, isotonic, scale or none.")] = (
         "conformal"
     ),
+    rate: Rate = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint there.")] = (
         False
     ),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run there.")] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, …")] = "cpu",
+    output: Output = None,
+    figure: Figure = None,
     json: Json = False,
 ) -> None:
     """Train a model on four-way split data and calibrate its spreads on movements unseen.
 
     Example: `zoo fit vae-dmp --data cmu-mocap/35-walk --set latent_dim=5 --run-dir runs/walk`
+
+    Of one's own: `zoo fit promp --data walk.csv --run-dir runs/own --figure bands.png`
     """
     from zoo.console import print_json, report_table
     from zoo.run import evaluate as score
-    from zoo.workflow import Plan, train
+    from zoo.workflow import Plan, forecast_report, train
 
-    plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device)
+    plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device, rate)
     advice = "repeat the command with --resume to go on from the last checkpoint, if there is one"
     with _interruptible(advice):
         run = train(plan, run_dir, resume=resume, overwrite=overwrite, progress=not json)
     test = plan.load()[3]
+    if output is not None or figure is not None:
+        forecast_report(run, test, seen=None, horizon=None, output=output, figure=figure)
     if json:
         print_json(score(run, test).to_json() | {"report": run.report()})
         return
@@ -169,7 +165,7 @@ def forecast(
     data: Unseen = None,
     seen: Annotated[int | None, typer.Option(help="Frames shown to the model.")] = None,
     horizon: Annotated[int | None, typer.Option(help="Frames to forecast.")] = None,
-    output: Annotated[Path | None, typer.Option(help="Write mean and bands: .csv or .nc.")] = None,
+    output: Output = None,
     figure: Figure = None,
     json: Json = False,
 ) -> None:

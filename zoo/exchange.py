@@ -20,8 +20,9 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.datasets.scaling import Scaler
 from zoo.errors import ExtrapolationWarning, WindowsWarning
 from zoo.inference.loader import whole
-from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.posterior import GuidePosterior
 from zoo.prediction import Predictive
+from zoo.streams import seeded
 from zoo.types import Batch, Posterior
 
 __all__ = ["Answer", "Exchange", "check_unseen", "fingerprints", "question"]
@@ -56,8 +57,9 @@ class Exchange:
     def movements(self, data: Any) -> Sequences:
         """Scaled movements; regression data are refused."""
         if not isinstance(data, Sequences):
+            remedy = "" if isinstance(data, Pairs) else ": zoo.Sequences.from_arrays(...) makes one"
             raise TypeError(
-                f"{self.assembly.entry.name} predicts Sequences; got {type(data).__name__}"
+                f"{self.assembly.entry.name} predicts Sequences; got {type(data).__name__}{remedy}"
             )
         model = self.assembly.model
         if isinstance(model, FollowsPhase) and model.phased:

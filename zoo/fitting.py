@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from zoo.assembly import Assembly
-from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.exchange import fingerprints
 from zoo.fingerprint import fingerprint
 from zoo.inference.train import Session
@@ -50,9 +50,11 @@ def fit(
     >>> run.reconstruct(data).shape
     (4, 20, 3)
     """
-    for part in (train, val):
-        if part is not None:
-            assembly.layout.check(part.layout)
+    if not isinstance(assembly, Assembly):
+        raise TypeError(f"fit trains what zoo.create gives; got {type(assembly).__name__}")
+    for part in (train,) if val is None else (train, val):
+        check_record(part, "fit")
+        assembly.layout.check(part.layout)
     session = Session(
         seed=assembly.seed, device=assembly.device, progress=progress, tensorboard=tensorboard
     )
@@ -91,6 +93,10 @@ def _fitted(
         scaler=learned.scaler,
         history=learned.history,
         seconds=max(epochs, time.monotonic() - began),
-        trained_on={"name": train.name, "fingerprints": fingerprints(train)},
+        trained_on={
+            "name": train.name,
+            "fingerprints": fingerprints(train),
+            "selected_on": [] if val is None else fingerprints(val),
+        },
         made_of=made_of,
     )

@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from zoo.streams import seeded
+
 __all__ = ["Deferred", "Predictive", "cdf", "log_density", "normal_score", "pooled", "quantile"]
 
 _BLOCK = 2**18
@@ -25,8 +27,8 @@ _FARTHEST = 37.0
 class Deferred:
     """Joint draws that are made when they are first asked for, of a random stream set beforehand.
 
-    ``make`` draws from torch's default generator. Its seed is drawn from it at once, so that the
-    draws depend on the moment they were promised in, not on that they are made in.
+    ``make`` draws from torch's default generator, whose seed is drawn from it at once: the draws
+    depend on when they were promised, not on when they are made.
 
     >>> promised = Deferred((3, 2), lambda: torch.randn(3, 2))
     >>> bool((promised.tensor() == promised.tensor()).all())
@@ -44,10 +46,8 @@ class Deferred:
 
     def tensor(self) -> Tensor:
         """The draws; the caller's random stream stays untouched."""
-        if self._made is None:
-            with torch.random.fork_rng(devices=[]):
-                torch.default_generator.manual_seed(self._seed)
-                self._made = self._make()
+        with seeded(self._seed):
+            self._made = self._make() if self._made is None else self._made
         return self._made
 
     def __reduce__(self) -> tuple[Callable[[Tensor], Tensor], tuple[Tensor]]:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from zoo import mixtures
+from zoo.arguments import level_of, seed_of, whole_number
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
 from zoo.mixtures import Predictive
 
@@ -153,8 +154,7 @@ class Prediction:
 
     def quantile(self, level: float) -> Tensor:
         """Quantile of every coordinate's marginal, ``0 < level < 1``."""
-        if not 0 < level < 1:
-            raise ValueError(f"level must be between 0 and 1; got {level}")
+        level = level_of(level)
         self._need_spread()
         if self.recalibration is not None:
             return self.recalibration.quantile(self.raw, level)
@@ -167,7 +167,8 @@ class Prediction:
         return mixtures.quantile(p.location, p.spread, score)
 
     def interval(self, level: float) -> tuple[Tensor, Tensor]:
-        """Central interval that holds ``level`` of the probability."""
+        """Central interval that holds ``level`` of the probability, ``0 < level < 1``."""
+        level = level_of(level)
         return self.quantile((1 - level) / 2), self.quantile((1 + level) / 2)
 
     def cdf(self, value: Tensor) -> Tensor:
@@ -200,9 +201,8 @@ class Prediction:
     def sample(self, count: int, *, seed: int = 0, joint: bool = True) -> Tensor:
         """``count`` draws with their noise; joint trajectories unless ``joint=False``."""
         self._need_spread()
-        if count < 1:
-            raise ValueError(f"count must be at least 1; got {count}")
-        generator = torch.Generator(device=self.mean.device).manual_seed(seed)
+        count = whole_number(count, "count")
+        generator = torch.Generator(device=self.mean.device).manual_seed(seed_of(seed))
         draws = self._paths(count, generator) if joint else self._marginals(count, generator)
         if self.recalibration is None:
             return draws

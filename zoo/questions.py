@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from zoo.arguments import seed_of, whole_number
 from zoo.datasets.records import Groups, Pairs, Sequences
 from zoo.datasets.split import nearest
 from zoo.errors import NotCapableError, UnknownNameError
@@ -47,8 +48,9 @@ class Setup:
         _check_section(self.section)
         for name in ("seen", "horizon", "draws"):
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1; got {value}")
+            if value is not None or name == "draws":
+                whole_number(value, name)
+        seed_of(self.seed)
 
     def frames(self, data: Sequences, *, beyond: bool = False) -> tuple[int, int]:
         """Frames seen and frames to forecast; by default a seventh is seen (10 of 70).

@@ -149,6 +149,8 @@ class Registry:
 
     def __getitem__(self, name: str) -> Entry:
         """The entry of that name; an unknown name lists the nearest ones."""
+        if not isinstance(name, str):
+            raise TypeError(f"a model is named by text, such as 'vae-dmp'; got {name!r}")
         if name not in self._entries:
             self._complete()
         if name not in self._entries:

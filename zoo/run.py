@@ -12,17 +12,17 @@ from torch import nn
 
 from zoo.answering import Answers, Query
 from zoo.assembly import create
-from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
 from zoo.exchange import Answer, Exchange, check_unseen
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.lock import free
 from zoo.prediction import Prediction, Predictive
 from zoo.questions import Setup
 from zoo.record import Record
 from zoo.storage import load_run, save_run
+from zoo.streams import seeded
 from zoo.tasks import Trained, posed
 from zoo.types import Wishes
 
@@ -157,6 +157,9 @@ def evaluate(
 
     A task without an answer on these data is a line that says why; the others are scored.
     """
+    if not hasattr(run, "trained_on"):
+        raise TypeError(f"evaluate scores a run, which zoo.fit gives; got {type(run).__name__}")
+    check_record(data, "evaluate")
     check_unseen(data, run.trained_on["fingerprints"], "evaluation")
     check_unseen(data, run.calibrated_on, "evaluation", "calibrated on")
     found, refused = posed(run, data, tasks, setup)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ _LIBRARIES = ("torch", "pyro-ppl", "gpytorch", "numpy")
 class _TrainedOn:
     name: str
     fingerprints: list[str]
+    selected_on: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)

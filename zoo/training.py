@@ -8,7 +8,7 @@ from typing import Any
 
 from zoo.assembly import Assembly
 from zoo.datasets.records import Pairs, Sequences
-from zoo.datasets.scaling import Scaler
+from zoo.datasets.scaling import Scaler, suited
 from zoo.inference.train import Session, train_model
 
 __all__ = ["Learned", "learn"]
@@ -30,7 +30,8 @@ def learn(
     session: Session,
 ) -> Learned:
     """Train copies of model and guide on scaled data; the assembly itself stays untouched."""
-    scaler = Scaler.fit(train, assembly.scaling)
+    asked = "scaling" in assembly.settings
+    scaler = Scaler.fit(train, assembly.scaling if asked else suited(train, assembly.scaling))
     model, guide = copy.deepcopy((assembly.model, assembly.guide))
 
     def prepared(data: Any) -> Any:

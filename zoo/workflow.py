@@ -15,10 +15,11 @@ from rich.table import Table as RichTable
 from zoo import archive
 from zoo.assembly import create
 from zoo.catalogue import CATALOGUE
-from zoo.datasets.library import load_data
+from zoo.datasets.library import load_data, means_file
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.answers import clusters
+from zoo.exchange import fingerprints
 from zoo.fitting import fit
 from zoo.prediction import Prediction
 from zoo.questions import Setup, beginning
@@ -43,6 +44,7 @@ class Plan:
     seed: int
     calibrate: str
     device: str
+    rate: float | None = None
 
     @classmethod
     def parse(
@@ -55,6 +57,7 @@ class Plan:
         seed: int,
         calibrate: str,
         device: str,
+        rate: float | None = None,
     ) -> Plan:
         """A plan from the words of a command line; each is checked and named when wrong."""
         methods = ("conformal", "isotonic", "scale", "none")
@@ -62,18 +65,20 @@ class Plan:
             raise ValueError(f"--calibrate is one of {', '.join(methods)}; got {calibrate!r}")
         return cls(
             model=model,
-            data=data or _own_data(model),
+            data=_lasting(data or _own_data(model)),
             settings=dict(_setting(word) for word in settings),
             by=by,
             parts=_shares(parts),
             seed=seed,
             calibrate=calibrate,
             device=device,
+            rate=rate,
         )
 
     def load(self) -> tuple[Any, Any, Any, Any]:
         """The data, split into train, val, calib and test."""
-        data = load_data(self.data)
+        given: dict[str, Any] = {} if self.rate is None else {"rate": self.rate}
+        data = load_data(self.data, **given)
         by = self.by or next(iter(data.groups))
         train, val, calib, test = data.split(by=by, parts=self.parts, seed=self.seed)
         return train, val, calib, test
@@ -134,14 +139,41 @@ def _enough(calib: Pairs | Sequences) -> bool:
 
 
 def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:
-    """A run and the data to try it on: another data set, or the test part of its own."""
+    """A run and the data to try it on: another data set, or the test part of its own.
+
+    A run that was trained in Python is tried on the movements of its data set that it was neither
+    trained nor calibrated on, nor chosen by.
+    """
     run = load(folder)
     if data is not None:
-        return run, load_data(data)
+        rate = run.assembly.layout.rate
+        given: dict[str, Any] = {"rate": rate} if rate and means_file(data) else {}
+        return run, load_data(data, **given)
     plan = Plan.kept(folder)
-    if plan is None:
-        raise DamagedRunError(f"{folder} holds no {_PLAN}: name a data set with --data")
-    return run, plan.load()[3]
+    return run, _unseen(run, folder) if plan is None else plan.load()[3]
+
+
+def _unseen(run: Run, folder: Path) -> Any:
+    """What a run without a plan has not seen of the data that it names."""
+    name, known = run.trained_on["name"], run.trained_on["fingerprints"]
+    advice = f"{folder} holds no {_PLAN}: name a data set with --data"
+    try:
+        whole = load_data(name)
+    except (LookupError, OSError, ValueError) as error:
+        raise DamagedRunError(f"{advice} ({error})") from None
+    found = fingerprints(whole)
+    if not set(known) <= set(found):
+        raise DamagedRunError(f"{advice}; {name!r} does not hold the movements it was trained on")
+    seen = {*known, *run.calibrated_on, *run.trained_on.get("selected_on", ())}
+    rows = [i for i, f in enumerate(found) if f not in seen]
+    if not rows:
+        raise DamagedRunError(f"{advice}; it was trained or calibrated on all of {name!r}")
+    return whole[rows]
+
+
+def _lasting(data: str) -> str:
+    """The name of a data set, or where a file is, whatever folder a later command runs in."""
+    return str(Path(data).resolve()) if means_file(data) else data
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.datasets.scaling import Kind, Scaler
+from zoo.datasets.scaling import Kind, Scaler, suited
 from zoo.errors import UnlikeUnitsWarning
 
 KINDS: tuple[Kind, ...] = ("standard", "center", "range", "none")
@@ -78,6 +78,29 @@ def test_one_scale_for_channels_of_several_units_is_warned_of() -> None:
     with pytest.warns(UnlikeUnitsWarning, match="channels in m, rad by one number"):
         Scaler.fit(mixed, "center")
     Scaler.fit(mixed, "standard")
+
+
+@pytest.mark.parametrize(
+    ("units", "factor", "kind"),
+    [
+        ("", 1e3, "standard"),
+        ("", 2.0, "center"),
+        ("rad", 1e3, "center"),
+        ("rad m", 1.0, "standard"),
+    ],
+)
+def test_one_scale_is_left_for_channels_that_have_none(
+    units: str, factor: float, kind: Kind
+) -> None:
+    values = np.random.default_rng(0).normal(size=(3, 40, 2)) * [1.0, factor]
+    labels = units.split() if " " in units else units
+    data = Sequences.from_arrays(values, rate=10.0, units=labels)
+    assert suited(data, "standard") == "standard"
+    if kind == "center":
+        assert suited(data, "center") == "center"
+        return
+    with pytest.warns(UnlikeUnitsWarning, match="scaling='standard' is used"):
+        assert suited(data, "center") == "standard"
 
 
 def test_padding_and_missing_entries_have_no_say() -> None:

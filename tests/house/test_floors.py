@@ -25,6 +25,7 @@ FLOORS = {
     "zoo.arguments": 0,
     "zoo.codehash": 0,
     "zoo.lock": 0,
+    "zoo.streams": 0,
     "zoo.inference": 1,
     "zoo.dynamics": 1,
     "zoo.nn": 1,
@@ -55,6 +56,7 @@ FLOORS = {
     "zoo.screening": 5,
     "zoo.console": 6,
     "zoo.cli": 6,
+    "zoo.options": 6,
     "zoo.demo": 6,
     "zoo.__main__": 6,
 }

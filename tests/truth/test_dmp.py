@@ -32,8 +32,8 @@ from zoo.errors import ExtrapolationWarning, NotFittedError
 from zoo.guides.exact import Config as ExactConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.models.dmp import DMP, Config
+from zoo.streams import seeded
 from zoo.types import Wishes
 
 SYSTEM = Transformation(dt=1 / 59)

@@ -16,9 +16,9 @@ from zoo.guides.exact import Config as ExactConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.elbo import bound
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.models import dmp
 from zoo.models.pca_dmp import Config, PcaDmp
+from zoo.streams import seeded
 from zoo.types import Batch
 
 FRAMES, CHANNELS, LATENT, KERNELS = 20, 5, 2, 4

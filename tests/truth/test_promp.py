@@ -16,8 +16,8 @@ from zoo.dynamics.weight_learning import Noise, Single, learn, similarity, views
 from zoo.dynamics.weights import Basis, Weights
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.models.promp import Config, ProMP
+from zoo.streams import seeded
 from zoo.types import Wishes
 
 FRAMES, CHANNELS, KERNELS = 30, 3, 5

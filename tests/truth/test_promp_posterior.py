@@ -21,10 +21,10 @@ from zoo.guides.exact import Config as GuideConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.elbo import bound
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.mixtures import cdf
 from zoo.models import promp
 from zoo.models.promp import Config, ProMP
+from zoo.streams import seeded
 from zoo.types import Wishes
 
 FRAMES, CHANNELS, KERNELS = 14, 2, 4

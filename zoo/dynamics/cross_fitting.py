@@ -111,6 +111,8 @@ def _folds(
 def _left(prepared: Prepared, values: Tensor, seen: Tensor) -> _Left:
     """Timings are the nearest ones to the first quarter of all that are expected."""
     frames, begin = len(values), max(2, len(values) // 4)
+    if begin >= frames:
+        raise ValueError(f"movements of at least 3 frames are needed; one of them has {frames}")
     early = torch.arange(frames)[:, None] < begin
     x = prepared.centred(values, seen)
     template = prepared.single.weights.mean.mean(0)

@@ -12,8 +12,8 @@ from zoo.datasets.records import Sequences
 from zoo.dynamics.plan import Plan
 from zoo.inference.elbo import sites
 from zoo.inference.loader import whole
-from zoo.inference.posterior import seeded
 from zoo.run import Run
+from zoo.streams import seeded
 from zoo.types import Batch
 
 __all__ = ["NoiseShare", "noise_share"]

@@ -19,8 +19,8 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import TrainingError
 from zoo.inference.journal import Journal
 from zoo.inference.minimise import MINIMISERS, Evaluate, Vector
-from zoo.inference.posterior import seeded
 from zoo.strategies import MarginalLikelihood
+from zoo.streams import seeded
 
 __all__ = ["evaluator", "fit_marginal", "maximise"]
 

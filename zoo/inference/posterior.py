@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, cast
 
 import pyro
@@ -14,27 +12,7 @@ from torch import Tensor, nn
 from zoo.errors import NotCapableError
 from zoo.types import Batch
 
-__all__ = ["GuidePosterior", "seeded"]
-
-
-@contextmanager
-def seeded(seed: int, device: torch.device | str = "cpu") -> Iterator[None]:
-    """Run a block on its own random stream and leave the caller's untouched.
-
-    >>> before = torch.random.get_rng_state()
-    >>> with seeded(0):
-    ...     first = torch.randn(1)
-    >>> bool((torch.random.get_rng_state() == before).all())
-    True
-    """
-    kind = torch.device(device)
-    devices = [] if kind.type == "cpu" else [kind]
-    with torch.random.fork_rng(devices=devices):
-        if devices:
-            torch.manual_seed(seed)
-        else:
-            torch.default_generator.manual_seed(seed)
-        yield
+__all__ = ["GuidePosterior"]
 
 
 class GuidePosterior:

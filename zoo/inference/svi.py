@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 import pyro
-import torch
 from torch import nn
 
 from zoo.datasets.records import Pairs, Sequences
@@ -24,6 +23,7 @@ from zoo.inference.state import FIGURES, Best, Parts, Place, State, fingerprint
 from zoo.inference.steps import NotFiniteError, Steps
 from zoo.inference.tempering import ramp
 from zoo.strategies import Svi
+from zoo.streams import seeded
 
 __all__ = ["fit_svi"]
 
@@ -63,12 +63,11 @@ def fit_svi(
     """
     place = None if folder is None else Path(folder)
     with ExitStack() as scope:
-        scope.enter_context(torch.random.fork_rng(devices=_accelerators(device)))
         log = scope.enter_context(Log(place, tensorboard=tensorboard))
-        training = _Training(model, guide, train, strategy, val, seed, device)
-        training.keep_in(place, log, checkpoint_seconds)
-        training.begin(resume)
-        scope.enter_context(pyro.validation_enabled(False))
+        with seeded(seed, device):
+            training = _Training(model, guide, train, strategy, val, seed, device)
+            training.keep_in(place, log, checkpoint_seconds)
+            training.begin(resume)
         bar = TrainingBar(
             epochs=training.strategy.epochs, steps=len(training.loader), shown=progress
         )
@@ -117,7 +116,8 @@ class _Training:
         try:
             while not self.state.finished:
                 try:
-                    self._epoch(bar, on_epoch)
+                    with seeded(self.steps.seed, self.steps.device), pyro.validation_enabled(False):
+                        self._epoch(bar, on_epoch)
                 except NotFiniteError as what:
                     self._go_back(str(what))
         except KeyboardInterrupt:
@@ -242,7 +242,3 @@ def _loader(data: Sequences | Pairs, strategy: Svi, seed: int, device: str) -> L
         stride=strategy.stride,
         seed=seed,
     )
-
-
-def _accelerators(device: str) -> list[torch.device]:
-    return [torch.device(device)] if torch.device(device).type == "cuda" else []

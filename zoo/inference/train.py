@@ -13,7 +13,7 @@ from torch import nn
 from zoo.datasets.records import Pairs, Sequences
 from zoo.inference.loader import whole
 from zoo.inference.marginal import fit_marginal
-from zoo.inference.posterior import GuidePosterior, seeded
+from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
 from zoo.parts import (
     Adopts,
@@ -25,6 +25,7 @@ from zoo.parts import (
     Prepares,
 )
 from zoo.strategies import Exact, Inference, MarginalLikelihood, Svi
+from zoo.streams import alone, seeded
 from zoo.types import Posterior
 
 __all__ = ["Session", "kept_out", "train_model"]
@@ -110,7 +111,8 @@ def _exact(
     model: Any, guide: Any, strategy: Any, train: Any, val: Any, session: Session
 ) -> list[dict[str, Any]]:
     _need(model, Conditions, "condition")
-    model.condition(train)
+    with alone():
+        model.condition(train)
     return []
 
 
