@@ -72,8 +72,7 @@ class _Draws:
         return held.tensor() if isinstance(held, Deferred) else held
 
     def __set__(self, owner: Predictive, value: Tensor | Deferred | None) -> None:
-        none = value is None or tuple(value.shape[:1]) == (0,)
-        owner.__dict__["_draws"] = None if none else value
+        owner.__dict__["_draws"] = None if value is None or value.shape[:1] == (0,) else value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +84,7 @@ class Predictive:
     the model has none to give. ``epistemic`` is a further standard deviation of the mean where a
     model knows it in closed form; the spread of the components counts as epistemic too.
     ``joint`` says that each component is one joint trajectory; ``draws`` are joint draws of the
-    noise-free path where the moments themselves are exact, or :class:`Deferred` ones; no draws are
-    None.
+    noise-free path where the moments themselves are exact, or :class:`Deferred` ones.
     """
 
     location: Float[Tensor, "component *shape"]

@@ -63,6 +63,16 @@ class Collapsed:
         value: Tensor = _Bound.apply(*arguments)  # type: ignore[no-untyped-call]
         return value
 
+    def of(
+        self,
+        k_uu: Float[Tensor, "inducing inducing"],
+        k_fu: Float[Tensor, "item inducing"],
+        noise: Float[Tensor, ""],
+    ) -> Float[Tensor, ""]:
+        """The same value of whatever covariances, differentiable by autograd."""
+        projection = solve_triangular(torch.linalg.cholesky(k_uu), k_fu.mT, upper=False).mT
+        return self.value(projection, noise, self.posteriors(projection, noise))
+
     def project(self, factor: Tensor, distances: Tensor, log_length: Tensor) -> Tensor:
         """Vᵀ = K_fu L⁻ᵀ, in memory that the next evaluation overwrites."""
         if self._memory.shape != distances.shape:

@@ -1,4 +1,4 @@
-"""Exact Gaussian process regression with the squared exponential covariance."""
+"""Exact Gaussian process regression with a stationary covariance."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotFittedError, TooManyItemsError
 from zoo.inference.evidence import dense, pairs_of, patterns
+from zoo.nn.covariances import Name, check_kernel, learned_shape, stationary
 from zoo.nn.gaussian import joint_draws, white_posterior
 from zoo.nn.kernels import median_distance, squared_distances, squared_exponential
 from zoo.prediction import Predictive
@@ -29,12 +30,14 @@ HELD, HELD_A_KERNEL = 10, 4
 class Config:
     """Settings of :class:`GaussianProcess`.
 
+    ``kernel``: the covariance, with a learned α where it is the rational quadratic;
     ``shared``: one length scale and noise ratio for all targets, hence one factorisation; ``ard``:
     a length scale for each feature; ``noise_floor``: smallest σ_n²/σ_f²; ``noise``: its starting
     value; ``joint_items``: up to so many new items are drawn jointly; ``memory``: what the matrices
     of items × items may take in GB. Some 14 are held at once for one target: 8 GB are 8,400 items.
     """
 
+    kernel: Name = "squared-exponential"
     shared: bool = False
     ard: bool = False
     noise: float = 0.1
@@ -44,6 +47,7 @@ class Config:
 
     def __post_init__(self) -> None:
         """Refuse settings that have no meaning."""
+        check_kernel(self.kernel)
         if not 0 < self.noise_floor < self.noise:
             raise ValueError(
                 f"0 < noise_floor < noise is needed; got {self.noise_floor} and {self.noise}"
@@ -66,10 +70,12 @@ class GaussianProcess(nn.Module):
     """A Gaussian process for each target, with its posterior in closed form.
 
     ``f_p ~ GP(0, σ_f² exp(−‖x − x'‖²/2l²))``, ``y_p ~ N(f_p, σ_n²)`` — (35), (36); the posterior is
-    (39), (40). Length scale l (of every feature with ``ard``), noise σ_n and signal σ_f maximise
-    the evidence (41) with the gradient (42); σ_f² is profiled out. Each target has its own
-    hyperparameters unless ``shared``. Missing targets are left out, target by target. Thesis
-    §2.1.6 and §3.2.3, with the squared distance that (35) means; Rasmussen & Williams (2006).
+    (39), (40). ``kernel`` takes a Matérn kernel of smoothness 1/2, 3/2 or 5/2 of gpytorch for the
+    squared exponential, or the rational quadratic (1 + ‖x − x'‖²/2αl²)^−α. Length scale l (of every
+    feature with ``ard``), noise σ_n, signal σ_f and α maximise the evidence (41) with the gradient
+    (42); σ_f² is profiled out. Each target has its own hyperparameters unless ``shared``. Missing
+    targets are left out, target by target. Thesis §2.1.6 and §3.2.3, with the squared distance that
+    (35) means; Rasmussen & Williams (2006).
 
     The posterior of f is exact given l, σ_n and σ_f, which are point estimates: their uncertainty
     is not in the bands. The Pyro program draws f at the inputs and y given f; 1 % of
@@ -95,6 +101,7 @@ class GaussianProcess(nn.Module):
         lengths = len(layout.inputs) if config.ard else 1
         self.log_length = nn.Parameter(torch.zeros(kernels, lengths, dtype=self.dtype))
         self.log_noise = nn.Parameter(torch.zeros(kernels, dtype=self.dtype))
+        self.log_shape = learned_shape(config.kernel, kernels)
         for name in ("inputs", "targets", "observed", "signal"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
         self._distances: Tensor | None = None
@@ -116,11 +123,14 @@ class GaussianProcess(nn.Module):
         self._check_size(len(data))
         self.inputs, self.targets = data.inputs.to(self.dtype), data.targets.to(self.dtype)
         self.observed = data.mask.to(self.dtype)
-        self._distances = squared_distances(self.inputs, self.inputs)
-        self._factors = []
+        distances = squared_distances(self.inputs, self.inputs)
+        fast = self.config.kernel == "squared-exponential"
+        self._distances, self._factors = distances if fast else None, []
         with torch.no_grad():
-            self.log_length.fill_(median_distance(self._distances).log())
+            self.log_length.fill_(median_distance(distances).log())
             self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
+            if self.log_shape is not None:
+                self.log_shape.zero_()
 
     def objective(self) -> Float[Tensor, ""]:
         """Minus the log evidence (41), summed over targets."""
@@ -248,7 +258,8 @@ class GaussianProcess(nn.Module):
         """κ + ρI over the observed items."""
         items = group.items
         if self._distances is None or self.config.ard:
-            covariance = self._kernel(group.kernel, self.inputs[items], self.inputs[items])
+            inputs = self.inputs[items]
+            covariance = self._kernel(group.kernel, inputs, inputs)
         else:
             distances = self._distances[items][:, items]
             covariance = squared_exponential(distances, self.log_length[group.kernel, 0])
@@ -256,9 +267,8 @@ class GaussianProcess(nn.Module):
         return covariance + torch.diag(noise)
 
     def _kernel(self, kernel: int, a: Tensor, b: Tensor) -> Tensor:
-        length = self.length[kernel]
-        distances = squared_distances(a / length, b / length)
-        return squared_exponential(distances, distances.new_zeros(()))
+        shape = None if self.log_shape is None else self.log_shape[kernel].exp()
+        return stationary(self.config.kernel, a, b, self.length[kernel], shape)
 
     def _factorised(self) -> list[Tensor]:
         if not self._factors:

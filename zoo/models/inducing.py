@@ -10,17 +10,21 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from zoo.errors import FewerInducingWarning
+from zoo.errors import FewerInducingWarning, NoiseDivergenceWarning
 from zoo.inference.collapsed import Collapsed
-from zoo.types import Batch
+from zoo.nn.covariances import Name, check_kernel
+from zoo.nn.kernels import squared_distances
+from zoo.types import Batch, Layout
 
-__all__ = ["Config", "Training", "View"]
+__all__ = ["Config", "Training", "View", "warn_of_divergence"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """Settings of :class:`~zoo.models.sparse_gp.SparseGaussianProcess`.
 
+    ``kernel``: the covariance, with a learned α where it is the rational quadratic; all but the
+    squared exponential hold the matrix of items × inducing inputs several times.
     ``inducing``: how many inducing inputs are drawn from the data, or which fraction of it (17 %
     in §3.3.4). A fraction gives up to ``most_inducing``, with a warning: cost grows with items · m²
     and memory with items · m, while for this smooth covariance a number m that grows with a power
@@ -34,6 +38,7 @@ class Config:
     """
 
     bound: Literal["fitc", "vfe"] = "fitc"
+    kernel: Name = "squared-exponential"
     inducing: int | float = 0.17
     most_inducing: int = 1000
     learn_inducing: bool = False
@@ -49,6 +54,7 @@ class Config:
         """Refuse settings that have no meaning."""
         if self.bound not in ("fitc", "vfe"):
             raise ValueError(f"bound is fitc or vfe; got {self.bound!r}")
+        check_kernel(self.kernel)
         whole = float(self.inducing).is_integer()
         if self.inducing <= 0 or (self.inducing > 1 and not whole):
             raise ValueError(f"inducing is a number or a fraction up to 1; got {self.inducing}")
@@ -95,6 +101,17 @@ class Training(NamedTuple):
     among: Float[Tensor, "inducing inducing"]
     across: Float[Tensor, "item inducing"]
 
+    @classmethod
+    def of(
+        cls,
+        inputs: Float[Tensor, "item feature"],
+        bound: Collapsed,
+        inducing: Float[Tensor, "inducing feature"],
+    ) -> Training:
+        """Distances among the inducing inputs and from them to all others, computed once."""
+        among = squared_distances(inducing, inducing).fill_diagonal_(0)
+        return cls(inputs, bound, among, squared_distances(inputs, inducing))
+
 
 @dataclass(frozen=True)
 class View:
@@ -127,3 +144,22 @@ class View:
         y = batch.values.flatten(1).mT
         mask = torch.ones_like(y).bool() if batch.mask is None else batch.mask.flatten(1).mT
         return cls(y, mask, factor, projection, left, diagonal)
+
+
+def warn_of_divergence(
+    layout: Layout,
+    fitc: Float[Tensor, " target"],
+    vfe: Float[Tensor, " target"],
+    limit: float,
+) -> None:
+    """Name the target whose noise standard deviations are furthest apart, beyond the factor."""
+    ratio = torch.maximum(fitc / vfe, vfe / fitc)
+    if bool((ratio > limit).any()):
+        worst = int(ratio.argmax())
+        warnings.warn(
+            f"{layout.channels[worst]}: FITC's noise is {fitc[worst]:.3g}, "
+            f"VFE's {vfe[worst]:.3g} (scaled), a factor {ratio[worst]:.1f} apart; "
+            "more inducing inputs bring them together",
+            NoiseDivergenceWarning,
+            stacklevel=3,
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
@@ -14,11 +13,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import NoiseDivergenceWarning, NotFittedError
+from zoo.errors import NotFittedError
 from zoo.inference.collapsed import Collapsed
 from zoo.inference.evidence import pairs_of, patterns
 from zoo.inference.marginal import evaluator, maximise
-from zoo.models.inducing import Config, Training, View
+from zoo.models.inducing import Config, Training, View, warn_of_divergence
+from zoo.nn.covariances import learned_shape, stationary
 from zoo.nn.gaussian import joint_draws, white_posterior
 from zoo.nn.kernels import median_distance, squared_distances, squared_exponential
 from zoo.prediction import Predictive
@@ -38,7 +38,8 @@ class SparseGaussianProcess(nn.Module):
     u integrated out. Inducing inputs are drawn from the data (thesis §2.1.6, 17 % in §3.3.4) and
     fixed unless ``learn_inducing``; targets share length scale and noise ratio σ_n²/σ_f², hence
     both Cholesky factors, and each has its own σ_f², profiled out. q(u) is exact given these, which
-    are point estimates: their uncertainty is not in the bands.
+    are point estimates: their uncertainty is not in the bands. ``kernel`` takes a Matérn kernel or
+    the rational quadratic of gpytorch for the squared exponential.
 
     The Pyro program draws v ~ N(0, I), u = σ_f L v with K_uu = L Lᵀ, then y. Items are independent
     given u, so that an automatic guide learns q(v) and the hyperparameters from minibatches
@@ -69,6 +70,7 @@ class SparseGaussianProcess(nn.Module):
         self.log_noise = nn.Parameter(torch.zeros((), dtype=self.dtype))
         signal = torch.zeros(len(layout.channels), dtype=self.dtype)
         self.log_signal = nn.Parameter(signal, requires_grad=False)
+        self.log_shape = learned_shape(config.kernel)
         self._set_inducing(torch.empty(0, dtype=self.dtype))
         for name in ("factor", "root", "mean", "pattern", "other_noise"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
@@ -97,11 +99,9 @@ class SparseGaussianProcess(nn.Module):
     def condition(self, data: Sequences | Pairs) -> None:
         """Take in the training pairs, draw inducing inputs, compute their distances once."""
         data = self._begin(data)
-        self._training = Training(
-            data.inputs,
-            Collapsed(data.targets.to(self.dtype), patterns(data.mask), self.config.bound),
-            *self._distances(data.inputs),
-        )
+        targets = data.targets.to(self.dtype)
+        bound = Collapsed(targets, patterns(data.mask), self.config.bound)
+        self._training = Training.of(data.inputs, bound, self.inducing.detach())
         if self.config.learn_inducing or self.config.ard:
             self._warm_start()
 
@@ -125,7 +125,9 @@ class SparseGaussianProcess(nn.Module):
     def objective(self) -> Float[Tensor, ""]:
         """Minus the collapsed bound on the log evidence, summed over targets."""
         training = self._need_training()
-        return training.bound(*self._geometry(training), self.noise)
+        if self.config.kernel == "squared-exponential":
+            return training.bound(*self._geometry(training), self.noise)
+        return training.bound.of(*self._covariances(training), self.noise)
 
     def settle(self) -> None:
         """Keep q(u) and σ_f² under the final hyperparameters; compare with the other bound."""
@@ -211,6 +213,8 @@ class SparseGaussianProcess(nn.Module):
         with torch.no_grad():
             self.log_length.fill_(median_distance(among).log())
             self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
+            if self.log_shape is not None:
+                self.log_shape.zero_()
         return data
 
     def _view(self, batch: Batch) -> View:
@@ -228,12 +232,6 @@ class SparseGaussianProcess(nn.Module):
         else:
             self.register_buffer("inducing", inputs)
 
-    def _distances(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Squared distances among the inducing inputs and from them to all others."""
-        inducing = self.inducing.detach()
-        among = squared_distances(inducing, inducing)
-        return among.fill_diagonal_(0), squared_distances(inputs, inducing)
-
     def _need_training(self) -> Training:
         if self._training is None:
             raise RuntimeError("the evidence needs training data; call condition(data) first")
@@ -249,21 +247,36 @@ class SparseGaussianProcess(nn.Module):
         k_uu = squared_exponential(training.among, self.log_length[0])
         return self._jittered(k_uu), training.across, self.log_length[0]
 
+    def _covariances(self, training: Training) -> tuple[Tensor, Tensor]:
+        """K_uu with its jitter, and K_fu."""
+        k_uu = self._kernel(self.inducing, self.inducing)
+        return self._jittered(k_uu), self._kernel(training.inputs, self.inducing)
+
+    def _projected(self, training: Training) -> tuple[Tensor, Tensor]:
+        """L of K_uu = L Lᵀ, and Vᵀ = K_fu L⁻ᵀ."""
+        if self.config.kernel == "squared-exponential":
+            k_uu, *across = self._geometry(training)
+            factor = torch.linalg.cholesky(k_uu)
+            return factor, training.bound.project(factor, *across)
+        k_uu, k_fu = self._covariances(training)
+        factor = torch.linalg.cholesky(k_uu)
+        return factor, torch.linalg.solve_triangular(factor, k_fu.mT, upper=False).mT
+
     def _jittered(self, k_uu: Tensor) -> Tensor:
         return k_uu + torch.diag(k_uu.new_full((len(k_uu),), self.config.jitter))
 
     def _kernel(self, a: Tensor, b: Tensor) -> Tensor:
-        distances = squared_distances(a / self.length, b / self.length)
-        return squared_exponential(distances, distances.new_zeros(()))
+        shape = None if self.log_shape is None else self.log_shape.exp()
+        return stationary(self.config.kernel, a, b, self.length, shape)
 
     @torch.no_grad()
     def _keep_posterior(self, training: Training) -> None:
         bound = training.bound
-        k_uu, across, log_length = self._geometry(training)
-        self.factor = torch.linalg.cholesky(k_uu)
-        found = bound.posteriors(bound.project(self.factor, across, log_length), self.noise)
+        self.factor, projection = self._projected(training)
+        found = bound.posteriors(projection, self.noise)
         count = bound.targets.shape[1]
-        self.pattern, self.mean = k_uu.new_zeros(count), k_uu.new_zeros(len(k_uu), count)
+        self.pattern = self.factor.new_zeros(count)
+        self.mean = self.factor.new_zeros(len(self.factor), count)
         for i, (q, (observed, targets)) in enumerate(zip(found, bound.groups, strict=True)):
             which = list(targets)
             self.log_signal[which] = (q.quadratic / observed.sum()).log()
@@ -276,16 +289,10 @@ class SparseGaussianProcess(nn.Module):
         config = replace(self.config, bound=bound, learn_inducing=False, compare=False, **changes)
         other = SparseGaussianProcess(self.layout, config)
         other._set_inducing(self.inducing.detach())
-        among, across = training.among, training.across
-        if self.config.learn_inducing:
-            among, across = other._distances(training.inputs)
-        targets, groups = training.bound.targets, training.bound.groups
-        other._training = Training(
-            training.inputs, Collapsed(targets, groups, bound), among, across
-        )
-        with torch.no_grad():
-            other.log_length.copy_(self.log_length[: len(other.log_length)])
-            other.log_noise.copy_(self.log_noise)
+        again = Collapsed(training.bound.targets, training.bound.groups, bound)
+        moved = Training.of(training.inputs, again, other.inducing)
+        other._training = moved if self.config.learn_inducing else training._replace(bound=again)
+        other._start_at(self)
         optimizer: Literal["l-bfgs", "newton"] = "l-bfgs" if config.ard else "newton"
         maximise(other, MarginalLikelihood(optimizer=optimizer), evaluator(other))
         return other
@@ -295,23 +302,19 @@ class SparseGaussianProcess(nn.Module):
 
         All at once from a poor start, the inputs settle in a far worse optimum.
         """
-        other = self._fixed(self.config.bound, ard=False)
-        with torch.no_grad():
-            self.log_length.copy_(other.log_length.expand_as(self.log_length))
-            self.log_noise.copy_(other.log_noise)
+        self._start_at(self._fixed(self.config.bound, ard=False))
+
+    @torch.no_grad()
+    def _start_at(self, other: SparseGaussianProcess) -> None:
+        """The hyperparameters of ``other``; its first length scale where both have not as many."""
+        self.log_length.copy_(other.log_length[: len(self.log_length)])
+        self.log_noise.copy_(other.log_noise)
+        if self.log_shape is not None and other.log_shape is not None:
+            self.log_shape.copy_(other.log_shape)
 
     def _compare(self) -> None:
         """Fit the variational bound from here and compare the noise."""
         other = self._fixed("vfe")
         other.settle()
         self.other_noise = other.noise_std
-        ratio = torch.maximum(self.noise_std / self.other_noise, self.other_noise / self.noise_std)
-        if bool((ratio > self.config.divergence).any()):
-            worst = int(ratio.argmax())
-            warnings.warn(
-                f"{self.layout.channels[worst]}: FITC's noise is {self.noise_std[worst]:.3g}, "
-                f"VFE's {self.other_noise[worst]:.3g} (scaled), a factor {ratio[worst]:.1f} apart; "
-                "more inducing inputs bring them together",
-                NoiseDivergenceWarning,
-                stacklevel=2,
-            )
+        warn_of_divergence(self.layout, self.noise_std, self.other_noise, self.config.divergence)
