@@ -270,7 +270,8 @@ def _of_entries(
     spread = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
     variance = spread + rest
     density = -(entries.errors(population.mean).square() / variance + variance.log()) / 2
-    return density[entries.seen & asked].mean()
+    mean: Tensor = density[entries.seen & asked].mean()
+    return mean
 
 
 def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:
