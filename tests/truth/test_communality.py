@@ -56,7 +56,7 @@ def test_the_error_of_movements_left_out_is_that_of_ridges_without_them() -> Non
 
 
 def _refitted(scaled: torch.Tensor, channel: int, ridge: float) -> float:
-    """Square error of ``channel`` from the other one over that of the mean, one left out each."""
+    """Square error of ``channel`` from the other one, over that of the mean of the rest."""
     count, error, usual = len(scaled), 0.0, 0.0
     x, y = scaled[:, 1 - channel] * count**0.5, scaled[:, channel]
     for i in range(count):
