@@ -24,6 +24,7 @@ __all__ = ["Learned", "Learning", "learn"]
 RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 INDEPENDENT = (0.0, 0.3, 1.0)
 SCALES = {"discrete": 16, "rhythmic": 8}
+LEAST = 3
 FEW = Shares(0.5, 0.5)
 LOW = 0.1
 INFORMATION = (1.0, 0.3, 0.1, 0.03, 0.01)
@@ -91,9 +92,10 @@ def learn(
         parameters, uncertainty = _weights(every.at(own), starts)
     fit, winner = _residuals(every, ratios, parameters, uncertainty)
     whole, early = every.of_channels(winner), begun.of_channels(winner)
-    shares, information = _chosen(
-        _LeftOut(fit, whole, early, _entries(primitive, movements, timings), floor)
-    )
+    shares, information = FEW, 1.0
+    if len(movements) >= LEAST:
+        entries = _entries(primitive, movements, timings)
+        shares, information = _chosen(_LeftOut(fit, whole, early, entries, floor))
     population = estimate(fit.parameters, fit.uncertainty, shares, floor)
     if not all(bool(seen.all()) for _, seen in movements):
         population = _refined(population, whole, fit.noise, shares, floor)
@@ -169,10 +171,7 @@ def _chosen(left_out: _LeftOut) -> tuple[Shares, float]:
     information: at 1 they would make up for residuals that go together over channels and time,
     which are no matter of movements' parameters.
     """
-    parameters = left_out.fit.parameters
-    if len(parameters) < 3:
-        return FEW, 1.0
-    alone = unshared(parameters)
+    alone = unshared(left_out.fit.parameters)
     every = [Shares(alone, part) for part in INDEPENDENT]
     shares = max(every, key=lambda s: left_out.density(s, LOW))
     return shares, max(INFORMATION, key=lambda c: left_out.density(shares, c))
