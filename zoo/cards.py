@@ -23,7 +23,7 @@ from zoo.assembly import options
 from zoo.catalogue import CATALOGUE
 from zoo.registry import Entry, load
 
-__all__ = ["Card", "card", "measured"]
+__all__ = ["Card", "as_markdown", "card", "measured"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +58,12 @@ class Card:
 
     def markdown(self) -> str:
         """The card as Markdown."""
-        lines = [f"# {self.entry.name}", "", _markdown(self.text), ""]
+        lines = [f"# {self.entry.name}", "", as_markdown(self.text), ""]
         lines += ["| setting | part | values | default |", "|---|---|---|---|"]
         for key, (part, kind, default) in self.settings.items():
             values = _type(kind).replace("|", "or")
             lines.append(f"| `{key}` | {part} | {values} | {default!r} |")
-        lines += [f"\n{_markdown(m)}" for m in self.meanings]
+        lines += [f"\n{as_markdown(m)}" for m in self.meanings]
         lines += [""] + [f"- {_sentence(r)}" for r in self.results]
         return "\n".join(lines)
 
@@ -153,7 +153,8 @@ def _prose(text: str) -> str:
     return "".join(p if i % 2 else re.sub(r"([*_])", r"\\\1", p) for i, p in enumerate(parts))
 
 
-def _markdown(text: str) -> str:
+def as_markdown(text: str) -> str:
+    """A docstring as Markdown: literal blocks as code, signs of formulas as they are."""
     parts = (f"```text\n{b}\n```" if literal else _prose(b) for literal, b in _blocks(text))
     return "\n\n".join(parts)
 

@@ -32,6 +32,24 @@ app = typer.Typer(
 )
 
 
+def _version(asked: bool) -> None:
+    """Print the version and stop."""
+    if asked:
+        from zoo import __version__
+
+        print(f"movezoo {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options of the command itself."""
+
+
 @app.command("list")
 def list_command(
     pattern: Annotated[str, typer.Argument(help="Glob, e.g. `'*dmp*'`.")] = "*",

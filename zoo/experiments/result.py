@@ -168,6 +168,10 @@ EXPERIMENTS: dict[str, Experiment] = {
         summary="a robot arm sent to goals it was never shown, against DMP, Fig. 53",
         module="zoo.experiments.e6_5",
     ),
+    "readme_forecast": Experiment(
+        summary="the README's figure: a walk forecast with its bands, on a trial held out",
+        module="zoo.experiments.readme_forecast",
+    ),
 }
 
 
