@@ -138,9 +138,9 @@ def write_results(home: Path) -> None:
     _navigation(home, "Results", [str(row[0].split("]")[0][1:]) for row in rows])
     lead = (
         "Every figure comes from a command of this project, which wrote it to `results/` with "
-        "seed, versions and duration. *Data* says whether it is the thesis' data, public data with a "
-        "published protocol, simulated, or one's own. Repeat one with `zoo experiment ID` or "
-        "`zoo leaderboard PROTOCOL`. Results without a commit were stored before commits were."
+        "seed, versions and duration. *Data* says whether it is the thesis' data, public data "
+        "with a published protocol, simulated, or one's own. Repeat one with `zoo experiment "
+        "ID` or `zoo leaderboard PROTOCOL`. Results without a commit were stored before commits were."
     )
     listed = table(("result", "what", "data"), rows)
     (home / "index.md").write_text(f"# Results\n\n{lead}\n\n{listed}\n", "utf-8")

@@ -128,7 +128,9 @@ class _Windows:
         movements, movement_mask, sequence = self._movements(self.sequence[rows])
         every = self.is_whole and len(rows) == self.total and bool((rows.diff() == 1).all())
         return Batch(
-            values=self.movements if every else self.frames.index_select(0, index).view(shape),
+            values=self.movements.clone()
+            if every
+            else self.frames.index_select(0, index).view(shape),
             mask=_gather(self.frame_mask, index, shape),
             inputs=self._inputs(rows),
             start=self.start[rows].to(self.device),
