@@ -140,7 +140,7 @@ def write_results(home: Path) -> None:
         "Every figure comes from a command of this project, which wrote it to `results/` with "
         "seed, versions and duration. *Data* says whether it is the thesis' data, public data "
         "with a published protocol, simulated, or one's own. Repeat one with `zoo experiment "
-        "ID` or `zoo leaderboard PROTOCOL`. Results without a commit were stored before commits were."
+        "ID` or `zoo leaderboard PROTOCOL`. Results without a commit are older."
     )
     listed = table(("result", "what", "data"), rows)
     (home / "index.md").write_text(f"# Results\n\n{lead}\n\n{listed}\n", "utf-8")
