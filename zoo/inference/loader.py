@@ -127,10 +127,9 @@ class _Windows:
         shape = (len(rows), self.window, -1)
         movements, movement_mask, sequence = self._movements(self.sequence[rows])
         every = self.is_whole and len(rows) == self.total and bool((rows.diff() == 1).all())
+        values = self.movements.clone() if every else self.frames.index_select(0, index)
         return Batch(
-            values=self.movements.clone()
-            if every
-            else self.frames.index_select(0, index).view(shape),
+            values=values.view(shape),
             mask=_gather(self.frame_mask, index, shape),
             inputs=self._inputs(rows),
             start=self.start[rows].to(self.device),
