@@ -13,7 +13,7 @@ help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
 demo: $(INSTALLED)  ## Train VAE-DMP, calibrate, forecast, print the table and draw the bands
-	$(BIN)/python -m zoo.demo
+	$(BIN)/python -m zoo.faces.demo
 
 test: lint types units notebooks core  ## Everything that must hold, with its own set-up
 

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from benchmarks.harness import store
 from zoo.errors import FewGroupsWarning
-from zoo.evaluation.calibration import RECALIBRATIONS, recalibrate
-from zoo.prediction import Prediction, Predictive
+from zoo.evaluation.calibration.recalibration import RECALIBRATIONS, recalibrate
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
 
 FRAMES, CHANNELS, REPEATS, CHECKED = 60, 6, 30, 200
 COUNTS = (3, 4, 12, 24)

@@ -17,8 +17,8 @@ import torch
 import zoo
 from benchmarks.harness import interleave, store
 from zoo.catalogue import CATALOGUE
-from zoo.registry import Entry
-from zoo.strategies import Svi
+from zoo.contract.registry import Entry
+from zoo.contract.strategies import Svi
 
 FRAMES, RATE, SEEN = 60, 30.0, 20
 TASKS = ("forecast", "impute", "reconstruct", "represent", "regress")

@@ -20,10 +20,11 @@ from torch import Tensor
 
 import zoo
 from benchmarks.harness import Timings, interleave, ratio, report, store
-from zoo.dynamics import kalman, rollout, sums
-from zoo.dynamics.dmp import Response, Transformation, discrete_basis, phase
-from zoo.dynamics.imitation import fit_matrix, trajectory_matrix
 from zoo.inference.loader import whole
+from zoo.movement import kalman, rollout
+from zoo.movement import sufficient_statistics as sums
+from zoo.movement.forcing import fit_matrix, trajectory_matrix
+from zoo.movement.response import Response, Transformation, discrete_basis, phase
 
 JOINTS, STEPS, KERNELS = 50, 1000, 20
 MANY = 100

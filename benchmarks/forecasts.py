@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 import zoo
 from benchmarks.harness import store
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Sequences
-from zoo.questions import Setup
-from zoo.strategies import Svi
+from zoo.evaluation.questions import Setup
 
 SHARES = (0.5, 0.1, 0.2, 0.2)
 SETUP = Setup(seen=10, horizon=60)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import torch
 
-from zoo.experiments.result import commit
+from zoo.studies.result import commit
 
 __all__ = ["Timings", "interleave", "ratio", "report", "store", "versions"]
 

@@ -24,11 +24,11 @@ import torch
 
 from benchmarks.harness import store
 from zoo.archive import replace_file
-from zoo.assembly import Assembly, create, options
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Sequences
-from zoo.inference import checkpoint
+from zoo.inference.resume import checkpoint
 from zoo.inference.svi import fit_svi
+from zoo.runs.assembly import Assembly, create, options
 
 __all__ = ["main", "rounds", "train"]
 

@@ -19,23 +19,23 @@ from torch import Tensor, nn
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.datasets.scaling import Scaler
-from zoo.dynamics.dmp import Response
-from zoo.dynamics.paths import PathPrior
+from zoo.datasets.records.scaling import Scaler
 from zoo.evaluation.scores import score
-from zoo.experiments.process_noise import NoiseShare, noise_share
-from zoo.experiments.result import Result, write_result
+from zoo.evaluation.tasks import answered
+from zoo.inference.harness import kept_out
 from zoo.inference.loader import whole
-from zoo.inference.train import kept_out
-from zoo.leaderboard.protocols import protocol
-from zoo.models import ae_dmp
-from zoo.models.pca import PCA
-from zoo.models.pca import Config as PcaConfig
-from zoo.models.vae_dmp import VaeDmp
-from zoo.prediction import Prediction
-from zoo.run import Run
+from zoo.models.filters.vae_dmp import VaeDmp
+from zoo.models.frames.pca import PCA
+from zoo.models.frames.pca import Config as PcaConfig
+from zoo.models.primitives import ae_dmp
+from zoo.movement.paths import PathPrior
+from zoo.movement.response import Response
+from zoo.prediction.prediction import Prediction
+from zoo.runs.run import Run
 from zoo.streams import seeded
-from zoo.tasks import answered
+from zoo.studies.chapter6.process_noise import NoiseShare, noise_share
+from zoo.studies.leaderboard.protocols import protocol
+from zoo.studies.result import Result, write_result
 from zoo.types import Batch, Layout, Posterior
 
 if TYPE_CHECKING:

@@ -18,10 +18,10 @@ import typer
 from torch import Tensor
 
 from benchmarks.harness import interleave, ratio, report, store
+from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs
 from zoo.inference.marginal import evaluator, fit_marginal
-from zoo.models.sparse_gp import Config, SparseGaussianProcess
-from zoo.strategies import MarginalLikelihood
+from zoo.models.processes.sparse_gp import Config, SparseGaussianProcess
 
 SEED = 0
 

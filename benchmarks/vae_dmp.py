@@ -23,7 +23,7 @@ from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.filtering import FilteringGuide
 from zoo.inference.elbo import bound, tight_bound
 from zoo.inference.loader import Loader
-from zoo.models.vae_dmp import Config, VaeDmp
+from zoo.models.filters.vae_dmp import Config, VaeDmp
 from zoo.types import Batch
 
 __all__ = ["main"]

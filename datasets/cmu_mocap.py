@@ -20,14 +20,7 @@ from zoo.datasets.cmu_files import BASE, HASHES
 from zoo.datasets.records import Sequences
 from zoo.datasets.skeleton import Skeleton
 from zoo.datasets.split import nearest
-from zoo.datasets.store import (
-    FileFormatError,
-    MissingDataError,
-    download,
-    find,
-    listed,
-    sought,
-)
+from zoo.datasets.store import FileFormatError, MissingDataError, download, find, listed, sought
 from zoo.errors import UnknownNameError
 
 __all__ = ["ACKNOWLEDGEMENT", "CONSTANT", "load", "load_skeleton"]

@@ -11,14 +11,7 @@ from numpy.random import Generator
 from torch import Tensor
 
 from zoo.datasets.records import Sequences
-from zoo.datasets.robot_arm import (
-    FRAMES,
-    HEIGHT,
-    START,
-    follow_path,
-    joint_sequences,
-    minimum_jerk,
-)
+from zoo.datasets.robot_arm import FRAMES, HEIGHT, START, follow_path, joint_sequences, minimum_jerk
 
 __all__ = ["load"]
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from zoo.datasets.agreement import agreed
-from zoo.datasets.columns import Part, parts_of_table, role
-from zoo.datasets.sequences import Sequences
+from zoo.datasets.records.agreement import agreed
+from zoo.datasets.records.columns import Part, parts_of_table, role
+from zoo.datasets.records.sequences import Sequences
 from zoo.datasets.store import FileFormatError, MissingDataError
 
 __all__ = ["is_file", "load"]

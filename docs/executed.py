@@ -21,8 +21,8 @@ from latex2mathml.converter import convert
 from nbclient import NotebookClient
 
 import zoo.catalogue
-from zoo.codehash import hashes
-from zoo.experiments.result import commit
+from zoo.inference.resume.codehash import hashes
+from zoo.studies.result import commit
 
 __all__ = ["executed", "page"]
 

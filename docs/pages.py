@@ -17,9 +17,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from zoo.cards import as_markdown, card  # noqa: E402
 from zoo.catalogue import CATALOGUE  # noqa: E402
-from zoo.registry import Entry  # noqa: E402
+from zoo.contract.registry import Entry  # noqa: E402
+from zoo.faces.cards import as_markdown, card  # noqa: E402
 
 __all__ = ["main", "model_page", "write_models", "write_results", "write_tables"]
 

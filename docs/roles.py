@@ -7,7 +7,7 @@ from typing import Any
 
 from griffe import Extension, Object
 
-from zoo.cards import as_markdown
+from zoo.faces.cards import as_markdown
 
 __all__ = ["House"]
 
@@ -24,7 +24,7 @@ class House(Extension):
 def markdown(docstring: str) -> str:
     """A docstring as Markdown.
 
-    >>> print(markdown("Of :class:`~zoo.run.Run`.\\n\\n>>> 1 + 1\\n2"))
+    >>> print(markdown("Of :class:`~zoo.runs.run.Run`.\\n\\n>>> 1 + 1\\n2"))
     Of ``Run``.
     <BLANKLINE>
     ```pycon

@@ -10,7 +10,7 @@ import pyro
 import torch
 from torch import Tensor, nn
 
-from zoo.parts import KnowsPosterior
+from zoo.contract.parts import KnowsPosterior
 from zoo.types import Batch, Layout, Sites
 
 __all__ = ["Config", "ExactPosterior"]

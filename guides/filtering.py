@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
-from zoo.dynamics.plan import Plan
 from zoo.guides.recurrence import FilteringNoise, NoiseNetwork, Stacked
+from zoo.movement.plan import Plan
 from zoo.nn.mlp import trunk
 from zoo.nn.moments import GaussianHead
 from zoo.types import Batch, Layout

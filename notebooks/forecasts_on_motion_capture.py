@@ -29,7 +29,7 @@ import numpy as np
 import torch
 
 import zoo
-from zoo.evaluation.figures import forecast_bands, reliability
+from zoo.evaluation.figures.bands import forecast_bands, reliability
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
 if real:

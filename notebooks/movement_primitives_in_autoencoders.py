@@ -48,10 +48,10 @@ from IPython.display import Markdown
 
 import zoo
 from zoo.errors import PosteriorCollapseWarning
-from zoo.evaluation.figures import forecast_bands, reliability
-from zoo.experiments import stored
-from zoo.player import posture_strip, posture_strips
-from zoo.prediction import Predictive
+from zoo.evaluation.figures.bands import forecast_bands, reliability
+from zoo.evaluation.figures.postures import posture_strip, posture_strips
+from zoo.prediction.predictive import Predictive
+from zoo.studies import stored
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
 plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
@@ -200,7 +200,7 @@ stored("E5.2")
 
 # %%
 if real:
-    from zoo.experiments.chapter5 import both
+    from zoo.studies.chapter5.walking import both
 
     mixed, kinds = both(), ("walking", "jogging")
     kind, sparsity = np.array(mixed.groups["movement"]), {"latent_dim": 10}
@@ -284,7 +284,7 @@ stored("E5.3")
 
 # %%
 if real:
-    from zoo.experiments.chapter5 import walking
+    from zoo.studies.chapter5.walking import walking
 
     train, unseen = walking()
     hidden = ["rfemur_rx", "rfemur_ry", "rfemur_rz", "rtibia_rx"]

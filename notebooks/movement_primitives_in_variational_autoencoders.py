@@ -52,14 +52,14 @@ from IPython.display import Markdown
 
 import zoo
 from zoo.datasets.robot_arm import end_effector
-from zoo.dynamics.template import match
 from zoo.errors import PosteriorCollapseWarning
-from zoo.evaluation.figures import reliability
-from zoo.experiments import stored
+from zoo.evaluation.figures.bands import reliability
+from zoo.evaluation.figures.postures import posture_map, posture_strips
+from zoo.faces.screening import screen_run
+from zoo.movement.template import match
 from zoo.nn.metric import sensitivity
-from zoo.player import posture_map, posture_strips
-from zoo.prediction import Predictive
-from zoo.screening import screen_run
+from zoo.prediction.predictive import Predictive
+from zoo.studies import stored
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
 plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False})
@@ -234,7 +234,7 @@ stored("E6.3")
 
 # %%
 if real:
-    from zoo.experiments.chapter5 import both
+    from zoo.studies.chapter5.walking import both
 
     mixed, parts = both(), (0.5, 0.25, 0.25)
 else:

@@ -19,16 +19,17 @@ from scipy import stats
 from support import data_of, movements
 from torch import Tensor
 
+from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs, Sequences
+from zoo.evaluation.questions import Setup, hide_joints, hide_section
+from zoo.evaluation.tasks import trials
 from zoo.inference.elbo import bound
 from zoo.inference.loader import Loader, stream, whole
 from zoo.inference.posterior import GuidePosterior
-from zoo.prediction import Prediction, Predictive
-from zoo.questions import Setup, hide_joints, hide_section
-from zoo.run import Run
-from zoo.strategies import MarginalLikelihood
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
+from zoo.runs.run import Run
 from zoo.streams import seeded
-from zoo.tasks import trials
 from zoo.types import Batch
 
 __all__ = [

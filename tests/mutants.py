@@ -228,7 +228,7 @@ def stored() -> dict[str, dict[str, Any]]:
 
 def store(rows: Sequence[dict[str, Any]]) -> str:
     """Write what was found; returns it as a line."""
-    from zoo.experiments.result import commit
+    from zoo.studies.result import commit
 
     killed = sum(row["outcome"] == "killed" for row in rows)
     share = 100 * killed / max(1, len(rows))

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 import zoo
-from zoo.assembly import Assembly, options
 from zoo.catalogue import CATALOGUE
+from zoo.contract.registry import Entry
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Pairs, Sequences
-from zoo.registry import Entry
-from zoo.run import Run
-from zoo.strategies import Svi
+from zoo.runs.assembly import Assembly, options
+from zoo.runs.run import Run
 
 FRAMES, CHANNELS = 24, 7
 

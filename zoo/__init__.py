@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, Any
 from zoo.version import __version__
 
 if TYPE_CHECKING:
-    from zoo.cards import card
     from zoo.catalogue import list_models, register
-    from zoo.datasets.joined import concatenate
+    from zoo.contract.registry import Entry
+    from zoo.contract.strategies import Exact, MarginalLikelihood, Svi
     from zoo.datasets.library import list_data, load_data
     from zoo.datasets.records import Pairs, Sequences
-    from zoo.ensemble import Ensemble, fit_ensemble
+    from zoo.datasets.records.joined import concatenate
+    from zoo.evaluation.questions import Setup
     from zoo.evaluation.table import Table
-    from zoo.fitting import fit
-    from zoo.player import play
-    from zoo.prediction import Prediction, Predictive
-    from zoo.questions import Setup
-    from zoo.registry import Entry
-    from zoo.run import Run, create, evaluate, load
-    from zoo.strategies import Exact, MarginalLikelihood, Svi
+    from zoo.faces.cards import card
+    from zoo.faces.play import play
+    from zoo.prediction.prediction import Prediction
+    from zoo.prediction.predictive import Predictive
+    from zoo.runs.ensemble import Ensemble, fit_ensemble
+    from zoo.runs.fitting import fit
+    from zoo.runs.run import Run, create, evaluate, load
     from zoo.types import Batch, Layout, Posterior, Sites
 
 __all__ = [
@@ -61,32 +62,32 @@ __all__ = [
 
 _HOME = {
     "Batch": "zoo.types",
-    "Ensemble": "zoo.ensemble",
-    "Entry": "zoo.registry",
-    "Exact": "zoo.strategies",
+    "Ensemble": "zoo.runs.ensemble",
+    "Entry": "zoo.contract.registry",
+    "Exact": "zoo.contract.strategies",
     "Layout": "zoo.types",
-    "MarginalLikelihood": "zoo.strategies",
+    "MarginalLikelihood": "zoo.contract.strategies",
     "Pairs": "zoo.datasets.records",
     "Posterior": "zoo.types",
-    "Prediction": "zoo.prediction",
-    "Predictive": "zoo.prediction",
-    "Run": "zoo.run",
+    "Prediction": "zoo.prediction.prediction",
+    "Predictive": "zoo.prediction.predictive",
+    "Run": "zoo.runs.run",
     "Sequences": "zoo.datasets.records",
-    "Setup": "zoo.questions",
+    "Setup": "zoo.evaluation.questions",
     "Sites": "zoo.types",
-    "Svi": "zoo.strategies",
+    "Svi": "zoo.contract.strategies",
     "Table": "zoo.evaluation.table",
-    "card": "zoo.cards",
-    "concatenate": "zoo.datasets.joined",
-    "create": "zoo.run",
-    "evaluate": "zoo.run",
-    "fit": "zoo.fitting",
-    "fit_ensemble": "zoo.ensemble",
+    "card": "zoo.faces.cards",
+    "concatenate": "zoo.datasets.records.joined",
+    "create": "zoo.runs.run",
+    "evaluate": "zoo.runs.run",
+    "fit": "zoo.runs.fitting",
+    "fit_ensemble": "zoo.runs.ensemble",
     "list_data": "zoo.datasets.library",
     "list_models": "zoo.catalogue",
-    "load": "zoo.run",
+    "load": "zoo.runs.run",
     "load_data": "zoo.datasets.library",
-    "play": "zoo.player",
+    "play": "zoo.faces.play",
     "register": "zoo.catalogue",
 }
 

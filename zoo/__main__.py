@@ -2,7 +2,7 @@
 
 import sys
 
-from zoo.cli import main
+from zoo.faces.cli import main
 
 __all__ = ["main"]
 

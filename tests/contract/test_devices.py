@@ -14,11 +14,11 @@ import pytest
 import torch
 from support import data_of, movements, run_of
 
+from zoo.contract.registry import load
 from zoo.inference.loader import whole
 from zoo.inference.posterior import GuidePosterior
-from zoo.prediction import Predictive
-from zoo.registry import load
-from zoo.run import Run
+from zoo.prediction.predictive import Predictive
+from zoo.runs.run import Run
 
 EXACT = ["pca", "gp", "fitc", "vfe", "mean", "last-value", "ar", "nearest-neighbour"]
 NAMES = [*EXACT, "mean-regressor", "vae", "vae-dynamics"]
@@ -63,7 +63,7 @@ def test_statistics_are_where_the_data_are(name: str) -> None:
 
 def test_penalties_are_of_the_model_s_own_number_type() -> None:
     """Settings reach float64 sums with all their digits."""
-    name = "zoo.models.autoregression:Autoregression"
+    name = "zoo.models.baselines.autoregression:Autoregression"
     model = load(name)(movements().layout, load(name).config_class(order=1, noise_floor=0.1))
     floor = model._shrunk(torch.zeros(2, 7, 7, dtype=torch.float64))
     assert floor.dtype == torch.float64 and float(floor[0, 0, 0]) == 0.1**2

@@ -15,11 +15,12 @@ import torch
 from support import CHANNELS, FRAMES, assembly_of, data_of, movements, pairs, run_of
 
 import zoo
-from zoo import capabilities
-from zoo.assembly import assemble, options
 from zoo.catalogue import CATALOGUE
+from zoo.contract import capabilities
+from zoo.contract.registry import CAPABILITIES, load
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Pairs, Sequences
-from zoo.datasets.scaling import Scaler
+from zoo.datasets.records.scaling import Scaler
 from zoo.errors import (
     DamagedRunError,
     NoJointSamplesError,
@@ -29,9 +30,8 @@ from zoo.errors import (
 )
 from zoo.inference.elbo import tight_bound
 from zoo.inference.loader import Loader
-from zoo.prediction import Prediction
-from zoo.registry import CAPABILITIES, load
-from zoo.strategies import Svi
+from zoo.prediction.prediction import Prediction
+from zoo.runs.assembly import assemble, options
 
 NAMES = [e.name for e in CATALOGUE]
 VARIATIONAL = [e.name for e in CATALOGUE if isinstance(e.inference, Svi)]

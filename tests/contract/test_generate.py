@@ -11,10 +11,10 @@ from support import CHANNELS, FRAMES, movements, run_of
 
 import zoo
 from zoo.catalogue import CATALOGUE
+from zoo.contract.strategies import Exact
 from zoo.datasets.records import Sequences
 from zoo.errors import ExtrapolationWarning
-from zoo.prediction import Prediction
-from zoo.strategies import Exact
+from zoo.prediction.prediction import Prediction
 
 NAMES = CATALOGUE.names(can="generate")
 EXACT = [name for name in NAMES if isinstance(CATALOGUE[name].inference, Exact)]

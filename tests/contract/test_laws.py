@@ -22,9 +22,9 @@ from support import assembly_of, data_of, run_of
 
 import zoo
 from zoo.catalogue import CATALOGUE
-from zoo.datasets.scaling import Scaler
-from zoo.registry import Entry
-from zoo.strategies import Svi
+from zoo.contract.registry import Entry
+from zoo.contract.strategies import Svi
+from zoo.datasets.records.scaling import Scaler
 
 NAMES = [e.name for e in CATALOGUE]
 BASELINES = {e.name for e in CATALOGUE if e.thesis.startswith("baseline")}

@@ -14,7 +14,7 @@ import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Sequences
 from zoo.errors import MovementLengthError, WindowsWarning
-from zoo.run import Run
+from zoo.runs.run import Run
 
 NAMES = CATALOGUE.names(can="forecast")
 ENDING = ["vae-dmp", "vae-dmp-single", "ae-dmp", "sparse-ae-dmp", "ae-then-dmp"]

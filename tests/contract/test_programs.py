@@ -19,10 +19,10 @@ from torch import Tensor
 
 import zoo
 from zoo.catalogue import CATALOGUE
-from zoo.dynamics.ancestral import Ancestral
+from zoo.contract.strategies import Svi
 from zoo.errors import NotCapableError
 from zoo.inference.loader import Loader
-from zoo.strategies import Svi
+from zoo.models.baselines.ancestral import Ancestral
 from zoo.types import Batch
 
 NAMES = [e.name for e in CATALOGUE]

@@ -8,8 +8,8 @@ import pytest
 from support import movements, pairs
 
 import zoo
-from zoo.inference.tempering import ramp
-from zoo.strategies import Svi
+from zoo.contract.strategies import Svi
+from zoo.inference.schedules import ramp
 
 
 @pytest.mark.parametrize("epochs", [1, 2, 3, 10, 150, 1499])

@@ -12,9 +12,9 @@ from support import assembly_of, data_of, movements, pairs, run_of
 import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
-from zoo.prediction import Prediction
-from zoo.questions import hide_joints
-from zoo.run import Run
+from zoo.evaluation.questions import hide_joints
+from zoo.prediction.prediction import Prediction
+from zoo.runs.run import Run
 
 DEGREE = 180 / math.pi
 CLOSE = {torch.float32: 1e-3, torch.float64: 1e-6}

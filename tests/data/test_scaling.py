@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.datasets.scaling import Kind, Scaler, suited
+from zoo.datasets.records.scaling import Kind, Scaler, suited
 from zoo.errors import UnlikeUnitsWarning
 
 KINDS: tuple[Kind, ...] = ("standard", "center", "range", "none")

@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 import zoo
-from zoo.assembly import options
 from zoo.catalogue import CATALOGUE
-from zoo.registry import load
+from zoo.contract.registry import load
+from zoo.runs.assembly import options
 
 every = pytest.mark.parametrize("name", CATALOGUE.names())
 

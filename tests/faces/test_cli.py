@@ -18,7 +18,7 @@ from support import pairs
 
 import zoo
 from zoo.catalogue import CATALOGUE
-from zoo.cli import main
+from zoo.faces.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,7 +33,9 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_list_needs_no_torch() -> None:
-    code = "import sys; from zoo.cli import main; main(['list']); print('torch' in sys.modules)"
+    code = (
+        "import sys; from zoo.faces.cli import main; main(['list']); print('torch' in sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("False")
     assert all(name in done.stdout for name in CATALOGUE.names())
@@ -203,7 +205,7 @@ def test_settings_are_numbers_lists_and_words(tmp_path: Path) -> None:
 def test_fitc_prints_both_noise_levels(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("zoo.workflow.load_data", lambda name: pairs())
+    monkeypatch.setattr("zoo.faces.commands.load_data", lambda name: pairs())
     words = ["fit", "fitc", "--data", "tiny", "--run-dir", str(tmp_path), "--set", "inducing=20"]
     words += ["--calibrate", "none"]
     assert main(words) == 0
@@ -229,7 +231,7 @@ def test_a_report_is_in_the_units_of_the_data() -> None:
 def test_an_interrupted_fit_says_so_and_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [sys.executable, "-c", "import sys; from zoo.cli import main; sys.exit(main())"]
+    words = [sys.executable, "-c", "import sys; from zoo.faces.cli import main; sys.exit(main())"]
     words += ["fit", "vae", "--data", "robot-arm", "--run-dir", str(tmp_path), "--json"]
     words += ["--calibrate", "none", "--set", "epochs=20000", "--set", "checkpoint_every=1"]
     words += ["--set", "patience=none"]

@@ -184,7 +184,7 @@ def test_docstrings_become_markdown() -> None:
     """Roles are names, examples are code, formulas keep their signs."""
     pytest.importorskip("griffe")
     with from_docs("roles") as roles:
-        text = roles.markdown("Of :class:`~zoo.run.Run`, a * b_c.\n\n>>> 1 + 1\n2")  # type: ignore[attr-defined]
+        text = roles.markdown("Of :class:`~zoo.runs.run.Run`, a * b_c.\n\n>>> 1 + 1\n2")  # type: ignore[attr-defined]
     assert text == "Of ``Run``, a \\* b\\_c.\n\n```pycon\n>>> 1 + 1\n2\n```"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import zoo
-from zoo.cli import main
+from zoo.faces.cli import main
 
 
 @pytest.fixture

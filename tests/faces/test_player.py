@@ -17,21 +17,13 @@ import torch
 from numpy.typing import NDArray
 
 import zoo
-from zoo.cli import main
+from zoo.datasets.bodies import Arm, Human, body_for
 from zoo.datasets.robot_arm import end_effector
 from zoo.datasets.skeleton import Bone, Skeleton
-from zoo.player import (
-    Arm,
-    Human,
-    Player,
-    Track,
-    body_for,
-    play,
-    posture_map,
-    posture_strip,
-    posture_strips,
-)
-from zoo.screening import screen_run
+from zoo.evaluation.figures.postures import posture_map, posture_strip, posture_strips
+from zoo.faces.cli import main
+from zoo.faces.play import Player, Track, play
+from zoo.faces.screening import screen_run
 
 BROWSER = shutil.which("chromium")
 BODY = Human(
@@ -118,7 +110,7 @@ def test_mistakes_are_named(arm: zoo.Sequences, monkeypatch: pytest.MonkeyPatch)
     holed = Track(name="holed", mean=torch.full((2, 7, 3), torch.nan))
     with pytest.raises(ValueError, match="not finite"):
         Player(body=Arm(), tracks=(holed,)).page()
-    monkeypatch.setattr("zoo.player.bodies.load_skeleton", lambda subject: BODY.skeleton)
+    monkeypatch.setattr("zoo.datasets.bodies.load_skeleton", lambda subject: BODY.skeleton)
     for foreign in ("angle", "elbow_rx"):
         with pytest.raises(ValueError, match=f"'{foreign}' moves no body"):
             body_for(["lleg_rx", foreign])

@@ -18,8 +18,8 @@ from support import movements
 
 import zoo
 from zoo.catalogue import CATALOGUE
-from zoo.cellcode import digest
-from zoo.cli import main
+from zoo.contract.methods import methods
+from zoo.contract.registry import Entry, Registry
 from zoo.errors import (
     BrokenPluginWarning,
     DamagedRunError,
@@ -27,9 +27,9 @@ from zoo.errors import (
     OtherTrainingError,
     UnknownNameError,
 )
-from zoo.leaderboard import own_protocol, run_leaderboard
-from zoo.methods import methods
-from zoo.registry import Entry, Registry
+from zoo.faces.cli import main
+from zoo.inference.resume.cellcode import digest
+from zoo.studies.leaderboard import own_protocol, run_leaderboard
 
 CELL = '''
 from dataclasses import dataclass
@@ -153,7 +153,7 @@ def test_a_training_of_a_notebook_is_resumed_while_its_code_is_the_same(tmp_path
 
     made_of = fitted(CELL).made_of
     assert made_of["code of cells:Level"].startswith("#")
-    assert "code of zoo.training" in made_of
+    assert "code of zoo.runs.training" in made_of
     fitted(CELL.replace("# a comment", "# another"))
     for old, new in (("SHIFT = 1.0", "SHIFT = 2.0"), ("sum((0, 1)) / mask", "sum((0, 1)) * mask")):
         with pytest.raises(OtherTrainingError, match="code of cells:Level changed"):
@@ -183,17 +183,17 @@ def test_a_class_of_a_notebook_is_hashed_with_the_modules_it_names() -> None:
     text = (
         CELL
         + """
-from zoo.models.pca import PCA
+from zoo.models.frames.pca import PCA
 
 class Mine(PCA):
     dtype = torch.float64
 """
     )
     zoo.register(entry_of(cell(text)["Mine"], guide="zoo.guides.exact:ExactPosterior"))
-    from zoo.fingerprint import fingerprint
+    from zoo.runs.fingerprint import fingerprint
 
     found = fingerprint(zoo.create("level", movements(), latent_dim=2), movements())
-    assert {"code of zoo.models.pca", "code of zoo.guides.exact"} <= set(found)
+    assert {"code of zoo.models.frames.pca", "code of zoo.guides.exact"} <= set(found)
     assert not any(name.startswith(("code of torch", "code of dataclasses")) for name in found)
 
 
@@ -236,12 +236,14 @@ def test_classes_say_what_they_lack() -> None:
         zoo.register(entry_of(int))
     with pytest.raises(ModuleNotFoundError, match=r"no module zoo.models.nowhere"):
         zoo.register(replace(CATALOGUE["mean"], name="lost", model="zoo.models.nowhere:Mean"))
-    with pytest.raises(ValueError, match=r"zoo.models.mean defines no class Gone"):
-        zoo.register(replace(CATALOGUE["mean"], name="lost", model="zoo.models.mean:Gone"))
+    with pytest.raises(ValueError, match=r"zoo.models.baselines.mean defines no class Gone"):
+        zoo.register(
+            replace(CATALOGUE["mean"], name="lost", model="zoo.models.baselines.mean:Gone")
+        )
     kind = cell()["Level"]
     zoo.register(entry_of(kind))
     with pytest.raises(ValueError, match="level names no data set of its own: give one"):
-        zoo.workflow.Plan.parse("level", None, [], None, ".6,.1,.15,.15", 0, "none", "cpu")
+        zoo.faces.commands.Plan.parse("level", None, [], None, ".6,.1,.15,.15", 0, "none", "cpu")
     del kind.dtype
     with pytest.raises(TypeError, match="Level needs a class attribute dtype"):
         zoo.create("level", movements())
@@ -264,12 +266,13 @@ def package(home: Path, name: str, text: str, *, value: str = "") -> None:
     (home / name).mkdir()
     (home / name / "__init__.py").touch()
     (home / name / "entry.py").write_text(text)
-    base = "from . import base\nfrom zoo.models import mean\n"
+    base = "from . import base\nfrom zoo.models.baselines import mean\n"
     (home / name / "model.py").write_text(
         f"{base}from .base import Base\nclass Mine(Base): pass\nclass Own(mean.Mean): pass\n"
     )
     (home / name / "base.py").write_text(
-        "from zoo.models.mean import Mean\nclass Base(Mean):\n    def generate(self): ...\n"
+        "from zoo.models.baselines.mean import Mean\n"
+        "class Base(Mean):\n    def generate(self): ...\n"
     )
     info = home / f"{name}-1.0.dist-info"
     info.mkdir()
@@ -302,7 +305,7 @@ def test_an_installed_package_joins_and_a_broken_one_is_named(tmp_path: Path) ->
         tmp_path,
         """
         import sys
-        from zoo.cli import main
+        from zoo.faces.cli import main
         assert main(["list", "--json"]) == 0
         assert "torch" not in sys.modules
         """,
@@ -331,7 +334,7 @@ def test_a_model_of_an_installed_package_trains_in_every_process(tmp_path: Path)
         """
         import numpy as np, tempfile, zoo
         from pathlib import Path
-        from zoo.leaderboard import own_protocol, run_leaderboard
+        from zoo.studies.leaderboard import own_protocol, run_leaderboard
         if __name__ == "__main__":
             data = zoo.Sequences.from_arrays(
                 np.random.default_rng(0).normal(size=(6, 20, 3)), rate=30.0
@@ -358,5 +361,5 @@ def test_plugins_are_sought_once_and_only_when_asked_for() -> None:
 
 
 def test_methods_of_bases_are_found() -> None:
-    found = methods("zoo.models.sparse_gp:SparseGaussianProcess")
+    found = methods("zoo.models.processes.sparse_gp:SparseGaussianProcess")
     assert {"regress", "condition", "objective", "settle"} <= found

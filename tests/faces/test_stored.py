@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from zoo.errors import UnknownNameError
-from zoo.experiments import EXPERIMENTS, stored
+from zoo.studies import EXPERIMENTS, stored
 
 
 @pytest.mark.parametrize("identifier", [e for e in EXPERIMENTS if e[1] in "56"])

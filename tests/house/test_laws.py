@@ -11,9 +11,9 @@ from laws import check_exact, check_program, check_uniform, judged
 from support import run_of
 from torch import Tensor
 
-from zoo.models.pca import PCA
-from zoo.prediction import Predictive
-from zoo.run import Run
+from zoo.models.frames.pca import PCA
+from zoo.prediction.predictive import Predictive
+from zoo.runs.run import Run
 from zoo.types import Batch
 
 

@@ -13,7 +13,7 @@ from laws import check_exact, check_program, check_sites, check_uniform, judged
 from support import data_of, movements
 
 import zoo
-from zoo.assembly import assemble
+from zoo.runs.assembly import assemble
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -66,6 +66,6 @@ def test_missing_entries_are_no_part_of_it(skeleton: tuple[str, zoo.Run]) -> Non
     holed = data_of(run.assembly.entry, missing=True)
     made = assemble(run.assembly.entry, holed.layout, SETTINGS[kind], seed=0, device="cpu")
     again = zoo.fit(made, holed)
-    trials = zoo.tasks.trials(again, data_of(run.assembly.entry)[:4])
+    trials = zoo.evaluation.tasks.trials(again, data_of(run.assembly.entry)[:4])
     assert all(bool(t.prediction.mean.isfinite().all()) for t in trials)
     assert {u for t in trials for u in t.prediction.units} <= {"rad", "N"}

@@ -17,7 +17,7 @@ def test_the_wheel_is_the_tree(tmp_path: Path) -> None:
     names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
     content = {n for n in names if ".dist-info/" not in n}
     assert {n.split("/")[0] for n in content} == {"zoo"}
-    expected = {"zoo/py.typed", "zoo/player/player.html"}
+    expected = {"zoo/py.typed", "zoo/faces/player.html"}
     for inside, home in HOMES.items():
         for file in (ROOT / home).rglob("*.py"):
             if file.relative_to(ROOT).parts[:2] not in {tuple(h.split("/")) for h in HOMES}:

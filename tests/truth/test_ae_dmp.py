@@ -10,15 +10,15 @@ import torch
 from pyro import poutine
 from support import movements
 
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Sequences
-from zoo.dynamics.imitator import Imitator
-from zoo.dynamics.population import Population
 from zoo.guides import point
 from zoo.inference.loader import whole
 from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
-from zoo.models import ae_dmp
-from zoo.strategies import Svi
+from zoo.models.primitives import ae_dmp
+from zoo.models.primitives.imitator import Imitator
+from zoo.models.primitives.population import Population
 
 IMITATOR = Imitator(frames=40, kernels=8)
 SOFT = torch.finfo(torch.float32).eps ** 0.5

@@ -17,7 +17,7 @@ import zoo
 from zoo import archive
 from zoo.catalogue import CATALOGUE
 from zoo.errors import DamagedRunError, NotRegisteredError
-from zoo.storage import FORMAT_VERSION
+from zoo.runs.disk import FORMAT_VERSION
 
 Meta, Tensors = dict[str, Any], dict[str, Tensor]
 STEPS = ("open", "fsync", "replace", "unlink")

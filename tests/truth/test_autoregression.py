@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.chain_selection import RIDGES, Choice
-from zoo.dynamics.chains import Chain, lags_up_to
 from zoo.inference.loader import whole
-from zoo.models.autoregression import Autoregression, Config
+from zoo.models.baselines.autoregression import Autoregression, Config
+from zoo.models.baselines.chain_selection import RIDGES, Choice
+from zoo.models.baselines.chains import Chain, lags_up_to
 from zoo.types import Batch
 
 A_1 = np.array([[1.2, 0.1], [-0.2, 0.9]])

@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from zoo.datasets.records import Pairs, Sequences
-from zoo.dynamics.analogues import interpolated
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
-from zoo.models import autoregression, last_value, mean, nearest_neighbour
-from zoo.models.autoregression import Autoregression
-from zoo.models.last_value import LastValue
-from zoo.models.mean import Mean, MeanRegressor
-from zoo.models.nearest_neighbour import NearestNeighbour
-from zoo.prediction import Prediction
+from zoo.models.baselines import autoregression, last_value, mean, nearest_neighbour
+from zoo.models.baselines.analogues import interpolated
+from zoo.models.baselines.autoregression import Autoregression
+from zoo.models.baselines.last_value import LastValue
+from zoo.models.baselines.mean import Mean, MeanRegressor
+from zoo.models.baselines.nearest_neighbour import NearestNeighbour
+from zoo.prediction.prediction import Prediction
 
 A_1 = np.array([[1.2, 0.1], [-0.2, 0.9]])
 A_2 = np.array([[-0.5, 0.0], [0.1, -0.3]])

@@ -16,18 +16,19 @@ from sklearn.isotonic import IsotonicRegression
 
 from zoo.errors import FewGroupsWarning, NoDensityError, UnknownNameError
 from zoo.evaluation.answers import Answer
-from zoo.evaluation.calibration import (
+from zoo.evaluation.calibration.factors import crossed, standardised
+from zoo.evaluation.calibration.pool import Pool
+from zoo.evaluation.calibration.promise import promised
+from zoo.evaluation.calibration.recalibration import (
     RECALIBRATIONS,
     Conformal,
     Scale,
     recalibrate,
     recalibration_from_state,
 )
-from zoo.evaluation.factors import crossed, standardised
-from zoo.evaluation.pool import Pool
-from zoo.evaluation.promise import promised
 from zoo.evaluation.scores import score
-from zoo.prediction import Prediction, Predictive
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
 
 KINDS = tuple(RECALIBRATIONS)
 

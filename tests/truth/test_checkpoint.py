@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from zoo import archive
 from zoo.errors import DamagedRunError
-from zoo.inference import checkpoint
+from zoo.inference.resume import checkpoint
 
 TENSORS = {"a/w": torch.tensor([1.0, torch.nan, -0.0]), "b": torch.arange(5, dtype=torch.uint8)}
 

@@ -10,7 +10,7 @@ import torch
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.communality import blocks, unshared
+from zoo.models.primitives.communality import blocks, unshared
 
 FRAMES, TOGETHER, ALONE, TRAINED, ASKED = 40, 10, 20, 10, 20
 

@@ -12,10 +12,14 @@ import torch
 from pyro import poutine
 
 import zoo
-from zoo import mixtures
 from zoo.datasets.records import Sequences
-from zoo.dynamics.dmp import Response, Transformation, discrete_basis, phase
-from zoo.dynamics.imitation import (
+from zoo.errors import ExtrapolationWarning, NotFittedError
+from zoo.guides.exact import Config as ExactConfig
+from zoo.guides.exact import ExactPosterior
+from zoo.inference.loader import whole
+from zoo.models.primitives.dmp import DMP, Config
+from zoo.models.primitives.population import Population
+from zoo.movement.forcing import (
     central_target_force,
     fit_matrix,
     locally_weighted_regression,
@@ -24,15 +28,11 @@ from zoo.dynamics.imitation import (
     target_force,
     trajectory_matrix,
 )
-from zoo.dynamics.kalman import PathNoise
-from zoo.dynamics.population import Population
-from zoo.dynamics.rollout import Timing, roll_out
-from zoo.dynamics.timing import period_of
-from zoo.errors import ExtrapolationWarning, NotFittedError
-from zoo.guides.exact import Config as ExactConfig
-from zoo.guides.exact import ExactPosterior
-from zoo.inference.loader import whole
-from zoo.models.dmp import DMP, Config
+from zoo.movement.kalman import PathNoise
+from zoo.movement.response import Response, Transformation, discrete_basis, phase
+from zoo.movement.rollout import Timing, roll_out
+from zoo.movement.timing import period_of
+from zoo.prediction import mixtures
 from zoo.streams import seeded
 from zoo.types import Wishes
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from zoo.dynamics.dmp import (
+from zoo.movement.response import (
     Response,
     Transformation,
     discrete_basis,

@@ -15,13 +15,13 @@ from torch import Tensor
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.locally_linear import LocallyLinear
+from zoo.evaluation.questions import Setup
 from zoo.guides.sequential import Config as GuideConfig
 from zoo.guides.sequential import SequentialGuide
 from zoo.inference.elbo import divergences, sites
 from zoo.inference.loader import whole
-from zoo.models.dvbf import Config, Dvbf
-from zoo.questions import Setup
+from zoo.models.filters.dvbf import Config, Dvbf
+from zoo.models.filters.locally_linear import LocallyLinear
 from zoo.types import Batch
 
 LATENT, FRAMES, CHANNELS = 2, 7, 3

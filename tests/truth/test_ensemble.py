@@ -11,8 +11,8 @@ from support import movements
 
 import zoo
 from zoo.errors import DamagedRunError, FewGroupsWarning, NoJointSamplesError, NotCapableError
-from zoo.mixtures import Predictive, pooled
-from zoo.questions import Setup
+from zoo.evaluation.questions import Setup
+from zoo.prediction.predictive import Predictive, pooled
 
 SETUP = Setup(seen=12, horizon=12, draws=20)
 

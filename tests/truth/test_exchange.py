@@ -13,9 +13,9 @@ from support import CHANNELS, assembly_of, data_of, movements, run_of
 import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
-from zoo.exchange import fingerprints
-from zoo.prediction import Prediction
-from zoo.questions import Setup
+from zoo.evaluation.questions import Setup
+from zoo.prediction.prediction import Prediction
+from zoo.runs.units import fingerprints
 
 QUICK = Setup(draws=10)
 LENGTHS = (24, 20, 24, 18, 24, 20, 22, 24)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from zoo.dynamics.plan import Latents, Plan
-from zoo.models.latent_dmp import Config
-from zoo.models.vae_dmp import VaeDmp
-from zoo.models.vae_dmp_rhythmic import Config as RhythmicConfig
-from zoo.models.vae_dmp_rhythmic import RhythmicVaeDmp
+from zoo.models.filters.latent_dmp import Config
+from zoo.models.filters.vae_dmp import VaeDmp
+from zoo.models.filters.vae_dmp_rhythmic import Config as RhythmicConfig
+from zoo.models.filters.vae_dmp_rhythmic import RhythmicVaeDmp
+from zoo.movement.plan import Latents, Plan
 from zoo.types import Layout
 
 LAYOUT = Layout(kind="sequences", channels=("a", "b"), units=("", ""), rate=30.0, frames=24)

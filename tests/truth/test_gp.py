@@ -12,14 +12,14 @@ from pyro.distributions import MultivariateNormal
 from pyro.infer import Predictive
 from scipy.stats import multivariate_normal
 
+from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs
 from zoo.errors import TooManyItemsError
 from zoo.guides.exact import Config, ExactPosterior
 from zoo.inference.elbo import bound
 from zoo.inference.loader import whole
 from zoo.inference.marginal import evaluator, fit_marginal
-from zoo.models import gp
-from zoo.strategies import MarginalLikelihood
+from zoo.models.processes import gp
 
 KINDS = pytest.mark.parametrize(
     "settings", [{}, {"shared": True}, {"ard": True}], ids=["own", "shared", "ard"]

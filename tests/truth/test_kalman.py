@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from zoo.dynamics.dmp import Transformation
-from zoo.dynamics.kalman import PathNoise, Smoother
+from zoo.movement.kalman import PathNoise, Smoother
+from zoo.movement.response import Transformation
 
 RATIOS = torch.tensor([[0.01], [1.0], [100.0]], dtype=torch.float64)
 

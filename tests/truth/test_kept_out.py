@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import zoo
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Sequences
-from zoo.inference.train import kept_out
-from zoo.strategies import Svi
+from zoo.inference.harness import kept_out
 
 QUICK = {"epochs": 3, "batch_size": 16, "latent_dim": 2, "hidden": 20}
 
@@ -51,7 +51,7 @@ def test_the_prior_knows_every_movement_and_the_noise_those_kept_out(name: str) 
     data = walks()
     run = zoo.fit(zoo.create(name, data, **QUICK), data)
     assert len(run.model.prior_movements) == len(data)
-    assert "kept_out" in zoo.assembly.options(run.assembly.entry)
+    assert "kept_out" in zoo.runs.assembly.options(run.assembly.entry)
     noisy = replace(data, values=data.values + 5 * torch.randn(data.values.shape))
     val = zoo.fit(zoo.create(name, data, **QUICK), data, val=noisy)
     plain = zoo.fit(zoo.create(name, data, kept_out=0.0, **QUICK), data)

@@ -11,10 +11,10 @@ import torch
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.kernel_ridge import Kernel, Problem, left_out_squares, predicted
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
-from zoo.models.kernel_ridge import Config, KernelRidge, Pattern
+from zoo.models.baselines.kernel_ridge import Config, KernelRidge, Pattern
+from zoo.models.baselines.ridge_regression import Kernel, Problem, left_out_squares, predicted
 
 KERNEL = Kernel(1.5, 0.05)
 

@@ -15,9 +15,9 @@ from support import pairs
 
 import zoo
 from zoo.inference.marginal import evaluator
-from zoo.models import gp, sparse_gp
-from zoo.nn.covariances import KERNELS, Name, stationary
-from zoo.nn.kernels import squared_distances, squared_exponential
+from zoo.models.processes import gp, sparse_gp
+from zoo.models.processes.covariances import KERNELS, Name, stationary
+from zoo.models.processes.kernels import squared_distances, squared_exponential
 
 NAMED: tuple[Name, ...] = ("matern12", "matern32", "matern52", "rational-quadratic")
 named = pytest.mark.parametrize("kernel", NAMED)

@@ -10,11 +10,11 @@ import torch
 from support import movements, run_of
 
 from benchmarks.latent_path_prior import PRIOR_DRAWS, AggregatedPrior, OwnPrior
-from zoo.dynamics.plan import Plan
-from zoo.experiments.process_noise import noise_share
 from zoo.inference.loader import whole
-from zoo.models.vae_dmp import Config
-from zoo.run import Run
+from zoo.models.filters.vae_dmp import Config
+from zoo.movement.plan import Plan
+from zoo.runs.run import Run
+from zoo.studies.chapter6.process_noise import noise_share
 
 DRAWS = 20_000
 

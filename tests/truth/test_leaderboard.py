@@ -18,10 +18,10 @@ from support import movements, pairs
 
 from zoo.datasets.records import Sequences
 from zoo.errors import UnknownNameError
-from zoo.experiments.result import Result
-from zoo.leaderboard import board, cells, own, own_protocol, statistics
-from zoo.leaderboard.cells import Cell
-from zoo.leaderboard.protocol import Fold, Protocol
+from zoo.studies.leaderboard import board, cells, own, own_protocol, statistics
+from zoo.studies.leaderboard.cells import Cell
+from zoo.studies.leaderboard.protocol import Fold, Protocol
+from zoo.studies.result import Result
 
 TINY = Protocol(
     name="tiny",
@@ -89,9 +89,11 @@ def test_cells_are_kept_by_data_and_code(tmp_path: Path, monkeypatch: pytest.Mon
     other = cells.compute(asked, tmp_path, replace(TINY, load=lambda: louder))
     assert first.prediction is not None and other.prediction is not None
     assert other.reused == "" and not torch.equal(other.prediction.mean, first.prediction.mean)
-    monkeypatch.setattr(cells, "code", lambda roots: {"code of zoo.tasks": "#other"})
+    monkeypatch.setattr(cells, "code", lambda roots: {"code of zoo.evaluation.tasks": "#other"})
     assert cells.compute(asked, tmp_path, TINY).reused == "training"
-    monkeypatch.setattr("zoo.fingerprint.hashes", lambda roots: {"zoo.models.mean": "other"})
+    monkeypatch.setattr(
+        "zoo.runs.fingerprint.hashes", lambda roots: {"zoo.models.baselines.mean": "other"}
+    )
     assert cells.compute(asked, tmp_path, TINY).reused == ""
 
 
@@ -116,7 +118,7 @@ ORPHANS = """
 import os, time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from zoo.leaderboard.cells import _begin
+from zoo.studies.leaderboard.cells import _begin
 if __name__ == "__main__":
     pool = ProcessPoolExecutor(1, get_context("spawn"), _begin, ((),))
     print(pool.submit(os.getpid).result(), flush=True)

@@ -11,12 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from zoo.leaderboard import findings, judge, tables
-from zoo.leaderboard.cells import Cell, Found
-from zoo.leaderboard.judge import Judged
-from zoo.leaderboard.protocol import Fold, Protocol, Published
-from zoo.leaderboard.protocols import protocol
-from zoo.prediction import Prediction, Predictive
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
+from zoo.studies.leaderboard import findings, judge, tables
+from zoo.studies.leaderboard.cells import Cell, Found
+from zoo.studies.leaderboard.judge import Judged
+from zoo.studies.leaderboard.protocol import Fold, Protocol, Published
+from zoo.studies.leaderboard.protocols import protocol
 
 GROUPS, FRAMES, CHANNELS = 16, 40, 6
 NAMES = tuple(f"joint_{i}" for i in range(CHANNELS))

@@ -11,10 +11,10 @@ import torch
 from support import movements
 
 from zoo.datasets.records import Sequences
-from zoo.leaderboard import PROTOCOLS, cells, own_protocol
-from zoo.leaderboard.cells import Cell
-from zoo.leaderboard.protocol import Protocol
-from zoo.prediction import Prediction
+from zoo.prediction.prediction import Prediction
+from zoo.studies.leaderboard import PROTOCOLS, cells, own_protocol
+from zoo.studies.leaderboard.cells import Cell
+from zoo.studies.leaderboard.protocol import Protocol
 
 QUICK = ("mean", "last-value", "ar", "nearest-neighbour", "kernel-ridge", "dmp", "promp", "pca-dmp")
 SEEN = 12

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import nn
 
+from zoo.contract.strategies import MarginalLikelihood
 from zoo.errors import DamagedRunError, TrainingError
 from zoo.inference.marginal import fit_marginal
 from zoo.inference.minimise import MINIMISERS
-from zoo.strategies import MarginalLikelihood
 
 OPTIMISERS = pytest.mark.parametrize("optimizer", sorted(MINIMISERS))
 

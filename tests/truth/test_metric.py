@@ -7,7 +7,7 @@ import torch
 from support import movements
 
 import zoo
-from zoo.models.latent_dmp import Config, LatentDmp
+from zoo.models.filters.latent_dmp import Config, LatentDmp
 from zoo.nn.metric import jacobians, pullback_metric, sensitivity
 from zoo.nn.mlp import mlp
 

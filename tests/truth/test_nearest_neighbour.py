@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.analogue_selection import Options, Trials
-from zoo.dynamics.gaps import Gaps
-from zoo.dynamics.re_entry import Library
 from zoo.inference.loader import whole
-from zoo.models.nearest_neighbour import Config, NearestNeighbour
+from zoo.models.baselines.analogue_selection import Options, Trials
+from zoo.models.baselines.gaps import Gaps
+from zoo.models.baselines.nearest_neighbour import Config, NearestNeighbour
+from zoo.models.baselines.re_entry import Library
 
 DATA = os.environ.get("MOVEZOO_DATA", "")
 real = pytest.mark.skipif(

@@ -6,9 +6,9 @@ import torch
 from laws import check_uniform
 from torch import Tensor
 
-from zoo.dynamics.cycles import CyclePrior
-from zoo.dynamics.gaussian_paths import stationary
-from zoo.dynamics.paths import PathPrior
+from zoo.movement.cycles import CyclePrior
+from zoo.movement.gaussian_paths import stationary
+from zoo.movement.paths import PathPrior
 
 COUNT, TIME, LATENT, SEEN, DRAWS = 400, 10, 2, 4, 200
 OBSERVATION = torch.tensor([[0.05, 0.02], [0.02, 0.08]], dtype=torch.float64)

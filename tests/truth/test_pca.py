@@ -17,7 +17,7 @@ from zoo.datasets.records import Sequences
 from zoo.guides.exact import Config as GuideConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.factors import Factors, closed_form, expectation_maximisation
-from zoo.models.pca import PCA, Config
+from zoo.models.frames.pca import PCA, Config
 from zoo.types import Batch
 
 

@@ -16,8 +16,8 @@ from zoo.guides.exact import Config as ExactConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.elbo import bound
 from zoo.inference.loader import whole
-from zoo.models import dmp
-from zoo.models.pca_dmp import Config, PcaDmp
+from zoo.models.primitives import dmp
+from zoo.models.primitives.pca_dmp import Config, PcaDmp
 from zoo.streams import seeded
 from zoo.types import Batch
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from scipy import stats
 
-from zoo import mixtures
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
-from zoo.mixtures import Deferred
-from zoo.prediction import Prediction, Predictive
+from zoo.prediction import mixtures
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Deferred, Predictive
 
 SHAPE = (3, 4, 2)
 

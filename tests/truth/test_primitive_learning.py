@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from zoo.dynamics.evidence import conjugate_weights
-from zoo.dynamics.rollout import Primitive, Timing
-from zoo.dynamics.timing import anchors
+from zoo.movement.conjugate_regression import conjugate_weights
+from zoo.movement.rollout import Primitive, Timing
+from zoo.movement.timing import anchors
 
 
 @pytest.mark.parametrize("kind", ["discrete", "rhythmic"])

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from zoo.datasets.records import Sequences
-from zoo.dynamics.rollout import Timing
-from zoo.dynamics.weight_learning import Noise, Single, learn, similarity, views_of
-from zoo.dynamics.weights import Basis, Weights
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
-from zoo.models.promp import Config, ProMP
+from zoo.models.primitives.promp import Config, ProMP
+from zoo.models.primitives.weight_learning import Noise, Single, learn, similarity, views_of
+from zoo.models.primitives.weights import Basis, Weights
+from zoo.movement.rollout import Timing
 from zoo.streams import seeded
 from zoo.types import Wishes
 

@@ -12,18 +12,17 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from zoo.datasets.records import Sequences
-from zoo.dynamics import cross_fitting
-from zoo.dynamics.cross_fitting import choose
-from zoo.dynamics.preparation import Preparation
-from zoo.dynamics.rollout import Timing
-from zoo.dynamics.scales import student_scales
 from zoo.guides.exact import Config as GuideConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.elbo import bound
 from zoo.inference.loader import whole
-from zoo.mixtures import cdf
-from zoo.models import promp
-from zoo.models.promp import Config, ProMP
+from zoo.models.primitives import cross_fitting, promp
+from zoo.models.primitives.cross_fitting import choose
+from zoo.models.primitives.preparation import Preparation
+from zoo.models.primitives.promp import Config, ProMP
+from zoo.models.primitives.scales import student_scales
+from zoo.movement.rollout import Timing
+from zoo.prediction.mixtures import cdf
 from zoo.streams import seeded
 from zoo.types import Wishes
 

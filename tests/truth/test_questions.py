@@ -10,7 +10,7 @@ from support import CHANNELS, FRAMES, movements
 
 import zoo
 from zoo.errors import MovementLengthError, NotCalibratedWarning, NotCapableError, UnknownNameError
-from zoo.questions import hide_joints, hide_section
+from zoo.evaluation.questions import hide_joints, hide_section
 
 TRAIN, HELD_OUT = movements()[:6], movements()[6:]
 QUICK: dict[str, Any] = {"latent_dim": 2, "epochs": 2}

@@ -17,14 +17,14 @@ import torch
 from support import movements, pairs
 
 import zoo
-from zoo.assembly import Assembly, assemble
 from zoo.catalogue import CATALOGUE
-from zoo.codehash import hashes
 from zoo.datasets.records import Sequences
 from zoo.errors import DamagedRunError, OtherTrainingError, RunExistsError, RunLockedError
-from zoo.experiments.kept import timed
-from zoo.experiments.kept import trained as trained_once
-from zoo.training import Learned, learn
+from zoo.inference.resume.codehash import hashes
+from zoo.runs.assembly import Assembly, assemble
+from zoo.runs.training import Learned, learn
+from zoo.studies.kept import timed
+from zoo.studies.kept import trained as trained_once
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = movements()[:6]
@@ -135,10 +135,12 @@ def test_a_changed_module_is_named(
     real = hashes
 
     def edited(roots: Any) -> dict[str, str]:
-        return real(roots) | {"zoo.models.vae": "another"}
+        return real(roots) | {"zoo.models.frames.vae": "another"}
 
-    monkeypatch.setattr("zoo.fingerprint.hashes", edited)
-    with pytest.raises(OtherTrainingError, match=r"holds another .*: code of zoo.models.vae chang"):
+    monkeypatch.setattr("zoo.runs.fingerprint.hashes", edited)
+    with pytest.raises(
+        OtherTrainingError, match=r"holds another .*: code of zoo.models.frames.vae chang"
+    ):
         zoo.fit(vae(), TRAIN, run_dir=trained[0], resume="auto")
 
 
@@ -156,7 +158,7 @@ def test_the_same_call_returns_the_same_bits_without_training(
     """Variational, closed-form and marginal-likelihood runs alike, and the duration stays."""
     data = pairs() if CATALOGUE[name].data == "pairs" else TRAIN
     first = zoo.fit(zoo.create(name, data, **settings), data, run_dir=tmp_path)
-    monkeypatch.setattr("zoo.fitting.learn", _never)
+    monkeypatch.setattr("zoo.runs.fitting.learn", _never)
     again = zoo.fit(zoo.create(name, data, **settings), data, run_dir=tmp_path, resume="auto")
     assert bits(again) == bits(first)
     assert (again.seconds, again.history) == (first.seconds, first.history)
@@ -229,7 +231,7 @@ def test_a_resumed_training_took_as_long_as_all_its_epochs(
     def resumed(*told: Any) -> Learned:
         return replace(learn(*told), history=rows)
 
-    monkeypatch.setattr("zoo.fitting.learn", resumed)
+    monkeypatch.setattr("zoo.runs.fitting.learn", resumed)
     assert zoo.fit(vae(), TRAIN).seconds == 1300.0
 
 
@@ -298,7 +300,7 @@ def test_what_is_damaged_says_what_to_do(tmp_path: Path) -> None:
 
 def test_a_training_that_failed_leaves_the_folder_free(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("zoo.fitting.learn", _never)
+        patch.setattr("zoo.runs.fitting.learn", _never)
         with pytest.raises(AssertionError):
             zoo.fit(vae(), TRAIN, run_dir=tmp_path)
     assert bits(zoo.fit(vae(), TRAIN, run_dir=tmp_path)) == bits(zoo.fit(vae(), TRAIN))
@@ -310,7 +312,7 @@ def test_every_member_of_an_ensemble_is_compared(tmp_path: Path) -> None:
 
     first = zoo.fit_ensemble(members(2), TRAIN, run_dir=tmp_path)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("zoo.fitting.learn", _never)
+        patch.setattr("zoo.runs.fitting.learn", _never)
         again = zoo.fit_ensemble(members(2), TRAIN, run_dir=tmp_path, resume="auto")
     assert [bits(r) for r in again.members] == [bits(r) for r in first.members]
     with pytest.raises(OtherTrainingError, match="latent_dim of the model was 2 and is 1 now"):
@@ -383,7 +385,7 @@ def _wait_for(file: Path, training: subprocess.Popen[bytes]) -> None:
 
 MODEL = '''
 """A model of its own, outside the package."""
-from zoo.models.mean import Config, Mean
+from zoo.models.baselines.mean import Config, Mean
 from .part import SHIFT
 
 class Mine(Mean):
@@ -399,7 +401,7 @@ def test_a_model_outside_the_package_is_hashed_with_its_own_modules(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An edit of what its file imports is another training; an edit of a comment is none."""
-    from zoo import codehash
+    from zoo.inference.resume import codehash
 
     home = tmp_path / "mine"
     home.mkdir()
@@ -418,7 +420,7 @@ def test_a_model_outside_the_package_is_hashed_with_its_own_modules(
         "code of mine",
         "code of mine.model",
         "code of mine.part",
-        "code of zoo.models.mean",
+        "code of zoo.models.baselines.mean",
     } <= (set(made_of))
     (home / "model.py").write_text(textwrap.dedent(MODEL).replace("# a comment", "# another"))
     codehash._read.cache_clear()
@@ -433,12 +435,22 @@ def test_the_code_of_a_result_is_all_that_it_imports() -> None:
     """Model, guide and harness with what they import; no other model, no scores, no catalogue."""
     found = zoo.fit(vae(), TRAIN)
     assert found.made_of == {}
-    from zoo.fingerprint import fingerprint
+    from zoo.runs.fingerprint import fingerprint
 
     code = {k.removeprefix("code of ") for k in fingerprint(vae(), TRAIN) if k.startswith("code ")}
-    assert {"zoo.models.vae", "zoo.guides.amortised", "zoo.inference.svi", "zoo.training"} <= code
-    assert {"zoo.nn.mlp", "zoo.datasets.scaling", "zoo.types"} <= code
-    assert not code & {"zoo.catalogue", "zoo.models.gp", "zoo.evaluation.scores", "zoo.cli"}
+    assert {
+        "zoo.models.frames.vae",
+        "zoo.guides.amortised",
+        "zoo.inference.svi",
+        "zoo.runs.training",
+    } <= code
+    assert {"zoo.nn.mlp", "zoo.datasets.records.scaling", "zoo.types"} <= code
+    assert not code & {
+        "zoo.catalogue",
+        "zoo.models.processes.gp",
+        "zoo.evaluation.scores",
+        "zoo.faces.cli",
+    }
 
 
 def test_a_module_without_source_is_named() -> None:

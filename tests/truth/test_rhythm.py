@@ -13,16 +13,16 @@ from torch import Tensor
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.cycles import CyclePrior
-from zoo.dynamics.gaussian_paths import stationary, stationary_draws
-from zoo.dynamics.paths import Readout
-from zoo.dynamics.plan import Plan
-from zoo.dynamics.template import fourier, learn_template, match
 from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.rhythmic import RhythmicGuide
 from zoo.inference.loader import Loader, whole
 from zoo.inference.posterior import GuidePosterior
-from zoo.models.vae_dmp_rhythmic import Config, RhythmicVaeDmp
+from zoo.models.filters.vae_dmp_rhythmic import Config, RhythmicVaeDmp
+from zoo.movement.cycles import CyclePrior
+from zoo.movement.gaussian_paths import stationary, stationary_draws
+from zoo.movement.paths import Readout
+from zoo.movement.plan import Plan
+from zoo.movement.template import fourier, learn_template, match
 
 PERIOD, FRAMES, CHANNELS = 40.0, 90, 6
 

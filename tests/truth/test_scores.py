@@ -13,11 +13,17 @@ import torch
 from scipy import stats
 
 from zoo.evaluation.answers import Answer, clusters, estimate
-from zoo.evaluation.figures import forecast_bands, pit_histogram, reliability, spread_over_time
+from zoo.evaluation.figures.bands import (
+    forecast_bands,
+    pit_histogram,
+    reliability,
+    spread_over_time,
+)
 from zoo.evaluation.proper import crps, energy_scores, variogram_scores
 from zoo.evaluation.scores import SCORES, Scores, score
 from zoo.evaluation.table import Table
-from zoo.prediction import Prediction, Predictive
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
 
 SHAPE = (4, 6, 3)
 GROUPS = {"trial": ("a", "b", "c", "d")}

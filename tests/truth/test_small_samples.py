@@ -9,8 +9,8 @@ from scipy import stats
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.dynamics.dmp import discrete_basis
-from zoo.dynamics.population import Shares, estimate
+from zoo.models.primitives.population import Shares, estimate
+from zoo.movement.response import discrete_basis
 
 FRAMES, CHANNELS, KERNELS, MOVEMENTS, SETS = 24, 6, 5, 4, 24
 

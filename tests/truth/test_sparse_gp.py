@@ -15,14 +15,14 @@ from pyro.distributions import MultivariateNormal
 from pyro.infer import Predictive
 from scipy.stats import multivariate_normal
 
+from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs
 from zoo.errors import FewerInducingWarning, NoiseDivergenceWarning
 from zoo.guides.exact import Config, ExactPosterior
 from zoo.inference import elbo
 from zoo.inference.loader import Loader, whole
 from zoo.inference.marginal import evaluator, fit_marginal
-from zoo.models import gp, sparse_gp
-from zoo.strategies import MarginalLikelihood
+from zoo.models.processes import gp, sparse_gp
 from zoo.types import Sites
 
 BOUNDS = ("fitc", "vfe")

@@ -13,17 +13,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from zoo.errors import (
-    OtherTrainingError,
-    PosteriorCollapseWarning,
-    TrainingError,
-    TrainingWarning,
-)
+from zoo.contract.strategies import Svi
+from zoo.errors import OtherTrainingError, PosteriorCollapseWarning, TrainingError, TrainingWarning
 from zoo.inference.elbo import bound, tight_bound
-from zoo.inference.history import History
 from zoo.inference.loader import Loader, stream
+from zoo.inference.resume.history import History
 from zoo.inference.svi import fit_svi
-from zoo.strategies import Svi
 from zoo.types import Batch
 
 

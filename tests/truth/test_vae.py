@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Sequences
 from zoo.guides.amortised import Amortised
 from zoo.guides.amortised import Config as GuideConfig
-from zoo.inference.chain import conditional_draws
 from zoo.inference.elbo import bound, tight_bound
 from zoo.inference.loader import Loader, whole
 from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
-from zoo.models.pca import PCA
-from zoo.models.pca import Config as PCAConfig
-from zoo.models.vae import VAE, Config
-from zoo.strategies import Svi
+from zoo.models.frames.denoising import conditional_draws
+from zoo.models.frames.pca import PCA
+from zoo.models.frames.pca import Config as PCAConfig
+from zoo.models.frames.vae import VAE, Config
 from zoo.types import Batch
 
 

@@ -15,17 +15,17 @@ from pyro import poutine
 from torch import Tensor
 
 from zoo.datasets.records import Sequences
-from zoo.dynamics.dmp import Response
-from zoo.dynamics.gaussian_paths import stationary
-from zoo.dynamics.paths import PathPrior, Readout
-from zoo.dynamics.plan import Plan
 from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.filtering import FilteringGuide
 from zoo.guides.recurrence import FilteringNoise, _Filter
 from zoo.inference.elbo import bound, check, divergences, sites, tight_bound
 from zoo.inference.loader import Loader, whole
 from zoo.inference.posterior import GuidePosterior
-from zoo.models.vae_dmp import Config, VaeDmp
+from zoo.models.filters.vae_dmp import Config, VaeDmp
+from zoo.movement.gaussian_paths import stationary
+from zoo.movement.paths import PathPrior, Readout
+from zoo.movement.plan import Plan
+from zoo.movement.response import Response
 from zoo.types import Batch
 
 LATENT, HIDDEN, FRAMES, CHANNELS = 2, 7, 12, 4

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Normal, kl_divergence
 
+from zoo.contract.strategies import Svi
 from zoo.datasets import pendulum
 from zoo.datasets.records import Sequences
 from zoo.guides.amortised import Amortised
@@ -18,9 +19,8 @@ from zoo.inference.elbo import tight_bound
 from zoo.inference.loader import Loader, whole
 from zoo.inference.posterior import GuidePosterior
 from zoo.inference.svi import fit_svi
-from zoo.models.vae_dynamics import Config, VAEDynamics
-from zoo.prediction import Predictive
-from zoo.strategies import Svi
+from zoo.models.frames.vae_dynamics import Config, VAEDynamics
+from zoo.prediction.predictive import Predictive
 
 
 def movements(controls: bool = True) -> Sequences:

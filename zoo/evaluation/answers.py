@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from zoo.prediction import Prediction
+from zoo.prediction.prediction import Prediction
 
 __all__ = ["Answer", "Estimate", "Groups", "clusters", "estimate", "group_sums"]
 

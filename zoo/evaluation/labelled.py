@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from zoo.prediction import Prediction
+from zoo.prediction.prediction import Prediction
 
 if TYPE_CHECKING:
     import xarray
@@ -25,7 +25,7 @@ def dataset(
     alone. Time is in s from the start of the movement where the rate is known, else in frames.
 
     >>> import torch
-    >>> from zoo.prediction import Predictive
+    >>> from zoo.prediction.predictive import Predictive
     >>> p = Prediction(predictive=Predictive(location=torch.zeros(1, 2, 3, 1), noise=torch.ones(1)),
     ...     axes=("sequence", "time", "channel"), names=("hip",), units=("rad",), task="forecast",
     ...     rate=10.0, offset=5)

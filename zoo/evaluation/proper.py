@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zoo.evaluation.answers import Answer
-from zoo.prediction import Prediction, Predictive
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
 
 __all__ = ["crps", "energy_scores", "variogram_scores"]
 

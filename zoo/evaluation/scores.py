@@ -15,7 +15,7 @@ from zoo.errors import NoDensityError, NoJointSamplesError
 from zoo.evaluation.answers import Answer, Estimate, Groups, estimate, group_sums
 from zoo.evaluation.proper import crps, energy_scores, variogram_scores
 from zoo.evaluation.reliability import LEVELS, Reliability
-from zoo.prediction import Prediction
+from zoo.prediction.prediction import Prediction
 
 __all__ = ["SCORES", "Scores", "score"]
 

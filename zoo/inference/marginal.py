@@ -15,11 +15,11 @@ from torch import nn
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import TrainingError
-from zoo.inference.journal import Journal
 from zoo.inference.minimise import MINIMISERS, Evaluate, Vector
-from zoo.strategies import MarginalLikelihood
+from zoo.inference.resume.journal import Journal
 from zoo.streams import seeded
 
 __all__ = ["evaluator", "fit_marginal", "maximise"]
@@ -40,7 +40,7 @@ def fit_marginal(
 ) -> list[dict[str, Any]]:
     """Fit a model with an evidence to scaled data; returns a row an iteration.
 
-    ``model`` is :class:`~zoo.parts.MaximisesEvidence`.
+    ``model`` is :class:`~zoo.contract.parts.MaximisesEvidence`.
     With ``folder`` every evaluation is kept in a journal there, from which ``resume`` goes on.
     Raises :class:`~zoo.errors.TrainingError` where the evidence is not finite at the start or
     nowhere near the best point.

@@ -14,7 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from zoo.inference.history import Row
+from zoo.inference.resume.history import Row
 
 __all__ = ["TrainingBar"]
 

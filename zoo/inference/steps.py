@@ -8,11 +8,11 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from zoo.contract.strategies import Svi
 from zoo.inference.elbo import Bound, check, tight_bound
 from zoo.inference.loader import Loader, stream
-from zoo.inference.state import Place
-from zoo.inference.tempering import learning_rate
-from zoo.strategies import Svi
+from zoo.inference.resume.state import Place
+from zoo.inference.schedules import learning_rate
 from zoo.types import Batch
 
 __all__ = ["Advances", "NotFiniteError", "Steps"]

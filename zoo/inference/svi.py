@@ -12,17 +12,17 @@ from typing import Literal
 import pyro
 from torch import nn
 
+from zoo.contract.strategies import Svi
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import TrainingError, TrainingWarning
-from zoo.inference import checkpoint
 from zoo.inference.collapse import warn_of_collapse
-from zoo.inference.history import History, Log, Row
 from zoo.inference.loader import Loader
 from zoo.inference.progress import TrainingBar
-from zoo.inference.state import FIGURES, Best, Parts, Place, State, fingerprint
+from zoo.inference.resume import checkpoint
+from zoo.inference.resume.history import History, Log, Row
+from zoo.inference.resume.state import FIGURES, Best, Parts, Place, State, fingerprint
+from zoo.inference.schedules import ramp
 from zoo.inference.steps import NotFiniteError, Steps
-from zoo.inference.tempering import ramp
-from zoo.strategies import Svi
 from zoo.streams import seeded
 
 __all__ = ["fit_svi"]

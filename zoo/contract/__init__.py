@@ -1,0 +1,1 @@
+"""What a model, a guide and an entry must be."""

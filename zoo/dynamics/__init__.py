@@ -1,1 +1,0 @@
-"""Dynamics as pure functions of tensors."""

@@ -1,0 +1,1 @@
+"""Recalibration of bands on groups that the model never saw."""

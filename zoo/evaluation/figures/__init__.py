@@ -1,0 +1,1 @@
+"""Figures of predictions, of their scores and of postures."""

@@ -1,0 +1,177 @@
+"""Answers of a trained model to questions, beside the truth that they are held against."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from torch import Tensor
+
+from zoo.datasets.records import Groups, Pairs, Sequences
+from zoo.errors import NotCalibratedWarning, UnanswerableError, UnknownNameError
+from zoo.evaluation.calibration.recalibration import recalibrate
+from zoo.evaluation.questions import NEEDS, Question, Setup, ask
+from zoo.prediction.prediction import Prediction, Recalibration
+
+__all__ = [
+    "Method",
+    "Predictor",
+    "Trained",
+    "Trial",
+    "answered",
+    "corrections",
+    "posed",
+    "trials",
+]
+
+Method = Literal["conformal", "isotonic", "scale"]
+
+
+class Predictor(Protocol):
+    """What a task needs of a run."""
+
+    @property
+    def capabilities(self) -> tuple[str, ...]:
+        """Tasks that the run's model can do."""
+        ...
+
+    def regress(self, data: Pairs, *, draws: int, seed: int) -> Prediction:
+        """Targets of the items."""
+        ...
+
+    def reconstruct(self, data: Sequences, *, draws: int, seed: int) -> Prediction:
+        """The movements through the model."""
+        ...
+
+    def forecast(self, data: Sequences, *, horizon: int, draws: int, seed: int) -> Prediction:
+        """The frames after those seen."""
+        ...
+
+    def impute(self, data: Sequences, *, draws: int, seed: int) -> Prediction:
+        """The missing entries."""
+        ...
+
+
+class Trained(Predictor, Protocol):
+    """A predictor that knows what it was trained on: a run or an ensemble of runs."""
+
+    @property
+    def name(self) -> str:
+        """Name of the entry or entries."""
+        ...
+
+    @property
+    def trained_on(self) -> dict[str, Any]:
+        """``name`` and ``fingerprints`` of the training data."""
+        ...
+
+    @property
+    def calibrated_on(self) -> list[str]:
+        """Fingerprints of the movements or items that its bands were calibrated on."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One answer and its truth; ``mask`` is True where the truth is known and was asked for."""
+
+    task: str
+    prediction: Prediction
+    truth: Tensor
+    mask: Tensor
+    groups: Groups
+
+
+def answered(run: Predictor, question: Question, *, draws: int, seed: int) -> Prediction:
+    """What a run says to a question; it gets nothing of the truth but what is ``given``."""
+    given = question.given
+    if question.need == "regress":
+        return run.regress(given, draws=draws, seed=seed)
+    if question.need == "reconstruct":
+        return run.reconstruct(given, draws=draws, seed=seed)
+    if question.need == "forecast":
+        return run.forecast(given, horizon=question.horizon, draws=draws, seed=seed)
+    return run.impute(given, draws=draws, seed=seed)
+
+
+def trials(
+    run: Predictor,
+    data: Pairs | Sequences,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> list[Trial]:
+    """Pose every task that the run's model can do, or those named, on ``data``.
+
+    A task without an answer on these data is left out, see :func:`posed`.
+    """
+    return posed(run, data, tasks, setup)[0]
+
+
+def posed(
+    run: Predictor,
+    data: Pairs | Sequences,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> tuple[list[Trial], dict[str, str]]:
+    """The answers to every task that the model can do, or to those named, and why others have none.
+
+    Where no task has an answer the first one's UnanswerableError is raised.
+    """
+    found: list[Trial] = []
+    refused: dict[str, UnanswerableError] = {}
+    how = setup or Setup()
+    for name in _names(run, tasks):
+        try:
+            found.append(_trial(run, ask(name, data, how), how))
+        except UnanswerableError as error:
+            refused[name] = error
+    if refused and not found:
+        raise next(iter(refused.values()))
+    return found, {name: str(error) for name, error in refused.items()}
+
+
+def _names(run: Predictor, tasks: Sequence[str] | None) -> list[str]:
+    """Tasks to pose; those that the model has not are named."""
+    names = [task for task, need in NEEDS.items() if need in run.capabilities]
+    if tasks is not None:
+        unknown = [t for t in tasks if t not in names]
+        if unknown:
+            raise UnknownNameError(
+                f"no task {unknown[0]!r} for this model; it has {', '.join(names)}"
+            )
+        names = list(tasks)
+    return names
+
+
+def corrections(
+    run: Predictor,
+    data: Pairs | Sequences,
+    method: Method,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> dict[str, Recalibration]:
+    """A correction of the spread for every task, fitted on ``data``.
+
+    A task without an answer on these data stays as it is, with a NotCalibratedWarning.
+    """
+    found, refused = posed(run, data, tasks, setup)
+    for task, reason in refused.items():
+        told = f"{task} has no answer on the calibration data and stays uncalibrated: {reason}"
+        warnings.warn(told, NotCalibratedWarning, stacklevel=3)
+    return {
+        trial.task: recalibrate(method, trial.prediction.raw, trial.truth, trial.mask, trial.groups)
+        for trial in found
+        if trial.prediction.has_spread
+    }
+
+
+def _trial(run: Predictor, question: Question, setup: Setup) -> Trial:
+    return Trial(
+        task=question.task,
+        prediction=answered(run, question, draws=setup.draws, seed=setup.seed),
+        truth=question.truth,
+        mask=question.mask,
+        groups=question.groups,
+    )

@@ -1,8 +1,0 @@
-"""Experiments of the thesis by id: each writes a table, its numbers and a figure."""
-
-from __future__ import annotations
-
-from zoo.experiments.result import EXPERIMENTS, Experiment, Result, run_experiment
-from zoo.experiments.stored import Stored, stored
-
-__all__ = ["EXPERIMENTS", "Experiment", "Result", "Stored", "run_experiment", "stored"]

@@ -1,0 +1,1 @@
+"""How a training goes on in the same bits after an interruption."""

@@ -1,0 +1,1 @@
+"""What every model must beat: means, last values, neighbours, regressions."""

@@ -1,0 +1,1 @@
+"""Latent state-space models with filtering guides."""

@@ -1,0 +1,251 @@
+"""What is generative in VAE-DMP: a linear latent state, driven by a DMP, decoded frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import pyro.distributions as dist
+import torch
+from jaxtyping import Float
+from pyro.distributions import TorchDistribution
+from torch import Tensor, nn
+
+from zoo.movement.lengths import common_length
+from zoo.movement.plan import Plan
+from zoo.movement.response import (
+    Response,
+    Transformation,
+    discrete_basis,
+    input_vector,
+    transition_matrix,
+)
+from zoo.nn.metric import jacobians
+from zoo.nn.mlp import Activation, mlp
+from zoo.types import Batch, Layout
+
+__all__ = ["Config", "LatentDmp"]
+
+ALPHA, ALPHA_FRAME = 25.0, 0.4
+BEYOND = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """``latent_dim`` d', ``hidden`` decoder units of ``activation``, ``kernels``, α (β = α/4).
+
+    None for α is 25 a movement, or 0.4 a frame for movements under 64 frames, whose Euler steps
+    would else be unstable. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
+    w and ż_1, in units of the acceleration αβ and of the movement's length; ``noise_scale`` is
+    where w_ε starts, in the same unit as w, and stays where ``fixed_noise``; ``output_std`` where
+    the constant output spread starts, in scaled units, never below ``output_floor``.
+
+    ``goal_scaling`` multiplies the forcing term by z^goal − z_0, the first frame, as §6.3.2 does:
+    w then says how a movement goes to its goal, wherever that is. ``common_forcing`` is the
+    standard deviation of w about one w̄ of all movements and dimensions, which is learned: paths
+    are straight in latent space, and the decoder has to bend them; None: 1, about 0.
+
+    ``flatness`` is the weight η of a prior p(g) ∝ exp(−η (‖J‖²/c² − 1)²) on the decoder, J = dx/dz
+    and c² its mean square, at points all over the box that the paths of a batch span, and a tenth
+    beyond: equal steps in latent space are then equal movements, also between the movements known
+    (after Chen et al., *Learning flat latent manifolds with VAEs*, ICML 2020). It needs a smooth
+    ``activation``.
+    """
+
+    latent_dim: int = 5
+    hidden: int = 200
+    activation: Activation = "relu"
+    kernels: int = 50
+    alpha: float | None = None
+    transition_hidden: int = 32
+    w_scale: float = 3.0
+    velocity_scale: float = 10.0
+    noise_scale: float = 0.3
+    fixed_noise: bool = False
+    output_std: float = 0.3
+    output_floor: float = 1e-3
+    goal_scaling: bool = False
+    common_forcing: float | None = None
+    flatness: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse empty layers and scales."""
+        for name in ("latent_dim", "hidden", "transition_hidden"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
+        if self.flatness < 0:
+            raise ValueError(f"flatness must be at least 0; got {self.flatness}")
+        if self.flatness and self.activation == "relu":
+            raise ValueError("flatness needs a smooth activation, such as softplus; got relu")
+        if self.kernels < 2:
+            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
+        scales = ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std")
+        for name in (*scales, "common_forcing"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+
+
+class LatentDmp(nn.Module):
+    """Networks, constants and densities' parameters of ``VaeDmp``."""
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float32
+    label: ClassVar[str] = "vae-dmp"
+    phased: ClassVar[bool] = True
+
+    w_noise: Tensor
+    basis: Tensor
+    step_matrix: Tensor
+    step_input: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """A model of movements of ``layout.frames`` frames, all of one length."""
+        super().__init__()
+        self.config, self.frames = config, common_length(self.label, layout)
+        self.latent_dim, self.kernels = config.latent_dim, config.kernels
+        self.goal_scaling = config.goal_scaling
+        channels, latent = len(layout.channels), config.latent_dim
+        self.system = _system(config.alpha, self.frames)
+        self.decoder = mlp([latent, config.hidden, channels], config.activation)
+        self.g = mlp([latent, config.transition_hidden, latent], "tanh")
+        nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
+        if config.common_forcing is not None:
+            self.w_common = nn.Parameter(torch.zeros(config.kernels, 1))
+        w_noise = config.noise_scale * torch.eye(latent)
+        if config.fixed_noise:
+            self.register_buffer("w_noise", w_noise)
+        else:
+            self.w_noise = nn.Parameter(w_noise)
+        self.output_root = nn.Parameter(torch.full((channels,), config.output_std**0.5))
+        eye = torch.eye(latent, dtype=torch.float64)
+        matrix = transition_matrix(self.system).T.contiguous()
+        self.register_buffer("basis", self.kernels_at(self.frames - 1).to(self.w_noise))
+        self.register_buffer("step_matrix", torch.kron(matrix, eye).to(self.w_noise))
+        step_input = torch.kron(input_vector(self.system)[None], eye)
+        self.register_buffer("step_input", step_input.to(self.w_noise))
+
+    @property
+    def output_std(self) -> Float[Tensor, " channel"]:
+        """The constant spread of every channel, (83)."""
+        return self.output_root.square() + self.config.output_floor
+
+    @property
+    def transition(self) -> Float[Tensor, "state state"]:
+        """A of (76) for row vectors (z*, ż)."""
+        return self.step_matrix
+
+    def embed(self, z: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch latent"]:
+        """z* = g(z)."""
+        moved: Tensor = z + self.g(z)
+        return moved
+
+    def forcing_prior(self, rows: int) -> TorchDistribution:
+        """p(w) of ``rows`` movements."""
+        shape = [rows, self.kernels, self.latent_dim]
+        zero, spread = self.basis.new_zeros(()), self.config.common_forcing
+        mean = zero if spread is None else self.w_common
+        prior = dist.Normal(mean, zero + (1.0 if spread is None else spread), validate_args=False)
+        normal: TorchDistribution = prior.expand(shape).to_event(2)
+        return normal
+
+    def scaled(
+        self,
+        w: Float[Tensor, "*sequence kernel latent"],
+        goal: Float[Tensor, "*sequence latent"],
+        start: Float[Tensor, "*sequence latent"] | None,
+    ) -> Float[Tensor, "*sequence kernel latent"]:
+        """w (z^goal − z_0), in the space of z*, where there is a ``start``: goal scaling."""
+        return w if start is None else w * (goal - start).unsqueeze(-2)
+
+    def flatness_prior(self, path: Float[Tensor, "window time latent"]) -> Float[Tensor, " window"]:
+        """log p(g) up to a constant, −η (‖J‖²/c² − 1)² at a random point for each window."""
+        low, high = (edge(path.detach(), (0, 1)) for edge in (torch.amin, torch.amax))
+        share = (1 + 2 * BEYOND) * torch.rand(len(path), self.latent_dim).to(path) - BEYOND
+        points = torch.lerp(low, high, share)
+        size = jacobians(self.decoder, points).square().sum((-1, -2))
+        return -self.config.flatness * (size / size.mean() - 1).square()
+
+    def noise_gain(self) -> Float[Tensor, "latent state"]:
+        """G: ε = ε̂ w_ε enters the next state as (77) says."""
+        return (self.system.stiffness * self.w_noise) @ self.step_input
+
+    def initial_state(
+        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
+    ) -> Float[Tensor, "window state"]:
+        """(z*_1, ż_1) of a window's first frame."""
+        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
+
+    def forces(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window latent"]:
+        """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
+        steps = batch.values.shape[1] - 1
+        goal = self.embed(plan.goal)
+        w = self.scaled(plan.w, goal, None if plan.start is None else self.embed(plan.start))
+        pull = goal + self.forcing(w, plan)
+        at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
+        row = at * pull.shape[1] + batch.sequence
+        picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
+        return picked.view(steps, len(batch), -1)
+
+    def forcing(
+        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
+    ) -> Float[Tensor, "step sequence latent"]:
+        """f_t in units of αβ of every step of whole movements, time-major."""
+        return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+
+    def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
+        """What goal and forcing term add to the state in every step, (77)."""
+        return self.forces(plan, batch) @ self.step_input
+
+    def path(
+        self,
+        z: Float[Tensor, "window latent"],
+        velocity: Float[Tensor, "window latent"],
+        plan: Plan,
+        ε: Float[Tensor, "window step latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "window time latent"]:
+        """z*_{1:T} by the linear response of (75): no loop over time."""
+        steps = batch.values.shape[1]
+        response = Response.of(self.system, steps, z.dtype, z.device)
+        noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
+        force = self.forces(plan, batch) + noise
+        begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
+        states = response.product(begin.flatten(1), force.flatten(1))
+        return states[0].view(steps, len(batch), -1).transpose(0, 1)
+
+    def paths(
+        self,
+        z: Float[Tensor, "*sample window time latent"],
+        velocity: Float[Tensor, "*sample window latent"],
+        plan: Plan,
+        ε: Float[Tensor, "*sample window step latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "*sample window time latent"]:
+        """The paths of every draw of the program's sites, such as Pyro's vectorised particles."""
+        lead = z.shape[:-3]
+        if not lead:
+            return self.path(z[:, 0], velocity, plan, ε, batch)
+        parts = zip(
+            z.flatten(0, -4), velocity.flatten(0, -3), plan.draws(), ε.flatten(0, -4), strict=True
+        )
+        found = [self.path(z[:, 0], v, p, ε, batch) for z, v, p, ε in parts]
+        paths: Tensor = torch.stack(found).unflatten(0, lead)
+        return paths
+
+    def kernels_at(self, steps: int, duration: float = 1.0) -> Float[Tensor, "step kernel"]:
+        """Ψ of the first ``steps`` steps of a movement ``duration`` times as long, in float64."""
+        time = torch.arange(steps, dtype=torch.float64)
+        whole = (self.frames - 1) * duration
+        return discrete_basis(time, kernels=self.kernels, duration=whole)
+
+
+def _system(alpha: float | None, frames: int) -> Transformation:
+    """The critically damped system, a movement long in its unit of time."""
+    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
+    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
+    if not system.stable:
+        raise ValueError(
+            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
+            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
+        )
+    return system

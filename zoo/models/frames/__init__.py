@@ -1,0 +1,1 @@
+"""Latent variables of single frames: linear, nonlinear, with dynamics."""

@@ -1,0 +1,1 @@
+"""Movement primitives in channels, components and autoencoders."""

@@ -1,0 +1,297 @@
+"""Dynamic movement primitives in a deep autoencoder: `ae-dmp` and its relatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import pyro
+import pyro.distributions as dist
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from zoo.contract.readiness import need
+from zoo.errors import NotFittedError
+from zoo.models.primitives.imitator import Imitator
+from zoo.movement.components import ramp
+from zoo.movement.demonstrations import extremes
+from zoo.movement.forcing import target_known
+from zoo.movement.lengths import check_end, check_whole, common_length
+from zoo.movement.paths import PathPrior, Readout
+from zoo.nn.metric import jacobians
+from zoo.nn.mlp import Activation, mlp, widths
+from zoo.prediction.predictive import Predictive
+from zoo.types import Batch, Layout, Posterior, Wishes
+
+__all__ = ["AeDmp", "Config"]
+
+PRIORS = {"normal": dist.Normal, "laplace": dist.Laplace}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Settings of :class:`AeDmp`.
+
+    ``hidden`` are the layers from a frame to the latent space, mirrored in the decoder;
+    ``penalty`` is λ of (72), forces in units of αβ; ``pretraining`` the share of the training in
+    which the autoencoder learns alone, 1 for two stages that are never joined; ``prior`` and
+    ``prior_scale`` that of y, whose ``laplace`` has η = 1/``prior_scale`` in (73); ``weight_scale``
+    the prior standard deviation of the decoder's weights (None: flat), without which a small y with
+    large weights escapes the prior of y; ``chain`` the
+    steps k of §5.3.4; ``noise_std`` where σ starts, never below ``noise_floor``, in scaled units.
+    """
+
+    latent_dim: int = 5
+    hidden: int | tuple[int, ...] = (36, 20)
+    activation: Activation = "tanh"
+    kernels: int = 20
+    alpha: float | None = None
+    penalty: float = 1e-3
+    pretraining: float = 0.3
+    prior: Literal["normal", "laplace"] = "normal"
+    prior_scale: float = 1.0
+    weight_scale: float | None = None
+    chain: int = 4
+    noise_std: float = 0.3
+    noise_floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse settings without a meaning."""
+        widths(self.hidden)
+        for name, least in (("latent_dim", 1), ("kernels", 2), ("chain", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
+        for name in ("penalty", "prior_scale", "weight_scale", "noise_std", "noise_floor"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+        if not 0 <= self.pretraining <= 1:
+            raise ValueError(f"pretraining must be in [0, 1]; got {self.pretraining}")
+
+
+class AeDmp(nn.Module):
+    r"""Movements that are one DMP each in the latent space of a denoising autoencoder.
+
+    With the encoded path y = enc(x), the roll-out ỹ = R θ of θ = (y₁, ẏ₁, g, w), and β = α/4::
+
+        θ ~ N(0, I),   y_t ~ N(0, 1) or Laplace(0, 1/η)                     (73)
+        x_t ~ N(g(ỹ_t), σ²),   f_target,t(y) ~ N(Ψ_t w, σ²/λ)
+
+    Minus the log joint times 2σ² is (72), beside the priors: its second term has the force (59)
+    that y needs, in units of αβ. θ is not a free parameter but the ridge regression of the encoded
+    path, so that a new demonstration needs no training. A first share of the training is that of
+    the autoencoder, x_t ~ N(g(y_t), σ²); ``ae-then-dmp`` ends there and rolls out what it found,
+    the non-integrated model of Table 2.
+
+    Thesis §5.2, (72), (73), §5.3.2; N. Chen, J. Bayer, S. Urban, P. van der Smagt, *Efficient
+    movement representation by embedding dynamic movement primitives in deep autoencoders*,
+    Humanoids 2015. Defaults: layers 50–36–20–5 and back, tanh (the thesis leaves it open),
+    20 kernels, λ = 1e-3, data in [−1, 1]. Latent path and networks are points: bands of
+    reconstructions and new movements hold the one σ of all channels alone, which is learned, and
+    estimated again on movements that the networks were not trained on, where there are any.
+    Forecasts and missing sections condition a mixture around the latent paths of the training
+    movements on the frames seen (:class:`~zoo.movement.paths.PathPrior`), with draws; after
+    training on a single movement it is as wide as that movement's own θ. Missing joints come from
+    the chain of §5.3.4, frame by frame, and the primitive nearest to the path it finds, which the
+    thesis leaves out. Movements must have one common length.
+    """
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float32
+    label: ClassVar[str] = "ae-dmp"
+    phased: ClassVar[bool] = True
+
+    prior_movements: Tensor
+    prior_residuals: Tensor
+    prior_shape: Tensor
+    reached: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """A model of movements of ``layout.frames`` frames, all of one length."""
+        super().__init__()
+        self.layout, self.config = layout, config
+        self.frames = common_length(self.label, layout)
+        self.latent_dim = config.latent_dim
+        self.imitator = Imitator(self.frames, config.kernels, config.alpha)
+        sizes = [config.latent_dim, *widths(config.hidden)[::-1], len(layout.channels)]
+        self.decoder = mlp(sizes, config.activation)
+        self.root = nn.Parameter(torch.tensor(config.noise_std**0.5))
+        self.settled = self.integrated = config.pretraining < 1
+        for name in ("prior_movements", "prior_residuals", "prior_shape", "reached"):
+            self.register_buffer(name, torch.empty(0))
+
+    @property
+    def σ(self) -> Float[Tensor, ""]:
+        """The one standard deviation of all channels."""
+        return self.root.square() + self.config.noise_floor
+
+    def advance(self, done: float) -> None:
+        """Join autoencoder and DMP after the pre-training's share of all steps."""
+        joins = self.config.pretraining < 1
+        self.integrated = joins and done >= self.config.pretraining
+        self.settled = self.integrated or not joins
+
+    def forward(self, batch: Batch) -> None:
+        """The generative program of whole movements: (72) as a log joint, or its first stage."""
+        windows, time = self._whole(batch).shape[:2]
+        zero = batch.values.new_zeros(())
+        prior = PRIORS[self.config.prior](zero, zero + self.config.prior_scale)
+        weights = dist.Normal(zero, zero + 1.0)
+        θ_shape = [windows, self.config.kernels + 3, self.latent_dim]
+        if self.config.weight_scale is not None:
+            pyro.factor("weights", self._weight_prior(self.config.weight_scale))
+        with pyro.plate("windows", size=batch.total, subsample=torch.arange(windows)):
+            y = pyro.sample("y", prior.expand([windows, time, self.latent_dim]).to_event(2))
+            θ = pyro.sample("theta", weights.expand(θ_shape).to_event(2))
+            path = self.imitator.roll_out(θ) if self.integrated else y
+            x = dist.Normal(self.decoder(path), self.σ).mask(_all(batch.mask))
+            pyro.sample("x", x.to_event(2), obs=batch.given(batch.values))
+            if self.integrated:
+                f, f_target = self.imitator.forces(y, θ)
+                force = dist.Normal(f, self.σ / self.config.penalty**0.5)
+                if batch.mask is not None:
+                    force = force.mask(target_known(batch.mask.any(-1))[..., None])
+                pyro.sample("f", force.to_event(2), obs=batch.given(f_target))
+
+    def _weight_prior(self, scale: float) -> Float[Tensor, ""]:
+        """log p of the decoder's weights, N(0, ``scale``²) each, up to a constant."""
+        weights = [p for p in self.decoder.parameters() if p.ndim == 2]
+        return -torch.stack([w.square().sum() for w in weights]).sum() / (2 * scale**2)
+
+    def imitate(
+        self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None
+    ) -> Float[Tensor, "window parameter latent"]:
+        """θ of the roll-outs nearest to ``path`` where it was seen."""
+        return self.imitator.fit(path, seen)
+
+    def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Roll-outs ỹ of the movements in the latent space, without a spread."""
+        return Predictive(location=self.imitator.roll_out(self._imitated(batch, posterior))[None])
+
+    def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """The movements rolled out by the DMP and decoded, p(x̂ | θ)."""
+        return self._decoded(self.imitator.roll_out(self._imitated(batch, posterior))[None])
+
+    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Missing joints by the chain of §5.3.4 and a DMP; missing frames given those seen."""
+        y, seen = self._encoded(batch, posterior)
+        if bool(seen.all()):
+            return self._decoded(self._smoothed(y, batch.mask)[None])
+        paths = self._completed(y, seen, y.shape[1], draws)
+        return self._decoded(torch.where(seen[..., None], y, paths))
+
+    def _smoothed(
+        self,
+        y: Float[Tensor, "sequence time latent"],
+        mask: Bool[Tensor, "sequence time channel"] | None,
+    ) -> Float[Tensor, "sequence time latent"]:
+        """Roll-outs nearest to the paths of whole movements with missing joints."""
+        if mask is None or y.shape[1] != self.frames:
+            return y
+        rolled = self.imitator.roll_out(self.imitator.fit(y))
+        return torch.where(mask.all(-1).all(-1)[:, None, None], y, rolled)
+
+    def forecast(
+        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
+    ) -> Predictive:
+        """Roll-outs given the encoded frames seen; phase 0 is the first frame."""
+        y, seen = self._encoded(batch, posterior)
+        known = y.shape[1]
+        return self._decoded(self._completed(y, seen, known + horizon, draws)[:, :, known:])
+
+    def generate(
+        self,
+        batch: Batch,
+        posterior: Posterior | None,
+        *,
+        wishes: Wishes,
+        draws: int,
+    ) -> Predictive:
+        """Goal changes (§5.3.6, in latent space), other durations, and switching (89)."""
+        duration = wishes.duration
+        θ, length = self._imitated(batch, posterior), round((self.frames - 1) * duration) + 1
+        if wishes.goal is not None:
+            θ = self.imitator.aimed(θ, need(posterior).encode(wishes.goal).mean)
+        if wishes.onto is None:
+            return self._decoded((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
+        η = ramp(length, wishes.start, wishes.steps)
+        here = self.imitator.design(length, duration=duration, weight=1 - η)
+        there = self.imitator.design(length, duration=duration, weight=η, begin=False)
+        path = here.to(θ) @ θ + there.to(θ) @ self._imitated(wishes.onto, posterior)
+        return self._decoded(path[None])
+
+    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
+        """Keep the θ of the training movements and what their roll-outs leave of the paths."""
+        mask = torch.ones_like(batch.values) > 0 if batch.mask is None else batch.mask
+        self.reached = extremes(batch.values, mask)
+        y, seen = self._encoded(batch, posterior)
+        self.prior_movements = self._imitated(batch, posterior)
+        rolled = self.imitator.roll_out(self.prior_movements)
+        self.prior_residuals = (y - rolled) * seen[..., None]
+        self.prior_shape = y.new_empty(0)
+        prior, window = self._prior(self.frames), (self.frames // 7, self.frames // 2)
+        tuned = prior.tuned(window, self._readout(y), self.prior_without)
+        self.prior_shape = y.new_tensor(tuned.shape)
+
+    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
+        """σ of movements that no network was trained on, never below what training found."""
+        y, _ = self._encoded(batch, posterior)
+        error = (self.decoder(y) - batch.values).square()
+        mean = error.mean() if batch.mask is None else (error * batch.mask).sum() / batch.mask.sum()
+        std = torch.maximum(mean.sqrt(), self.σ)
+        self.root.copy_((std - self.config.noise_floor).sqrt())
+
+    def prior_without(self, row: int) -> PathPrior:
+        """The mixture over latent paths of all training movements but one."""
+        return self._prior(self.frames, torch.arange(len(self.prior_movements)) != row)
+
+    def _readout(self, y: Float[Tensor, "sequence time latent"]) -> Readout:
+        J = jacobians(self.decoder, y.flatten(0, 1)).detach().double()
+        std = self.σ.detach().double().expand(J.shape[1])
+        return Readout(J.unflatten(0, y.shape[:2]), std)
+
+    def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
+        """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
+        if not self.prior_movements.numel():
+            raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
+        kept = slice(None) if rows is None else rows
+        θ, residuals = self.prior_movements[kept].double(), self.prior_residuals[kept].double()
+        return self.imitator.prior(θ, residuals, length, self.prior_shape.tolist())
+
+    def _completed(
+        self,
+        y: Float[Tensor, "sequence time latent"],
+        seen: Bool[Tensor, "sequence time"],
+        length: int,
+        draws: int,
+    ) -> Float[Tensor, "sample sequence frame latent"]:
+        """Draws of paths of ``length`` frames given the latent frames seen."""
+        check_end(self.label, self.frames, y.shape[1], length - y.shape[1])
+        return self._prior(length).completed(y, seen, draws)
+
+    def _encoded(
+        self, batch: Batch, posterior: Posterior | None
+    ) -> tuple[Float[Tensor, "sequence time latent"], Bool[Tensor, "sequence time"]]:
+        """Latent frames, missing joints filled by passing them k times; frames seen at all."""
+        guide, x = need(posterior), batch.values
+        if batch.mask is None:
+            return guide.encode(x).mean, torch.ones_like(x[..., 0], dtype=torch.bool)
+        x = torch.where(batch.mask, x, 0.0)
+        for _ in range(self.config.chain):
+            x = torch.where(batch.mask, x, self.decoder(guide.encode(x).mean))
+        return guide.encode(x).mean, batch.mask.any(-1)
+
+    def _imitated(self, batch: Batch, posterior: Posterior | None) -> Tensor:
+        self._whole(batch)
+        return need(posterior).draw(batch, 1)["theta"][0]
+
+    def _whole(self, batch: Batch) -> Tensor:
+        check_whole(self.label, self.frames, batch.values.shape[1])
+        return batch.values
+
+    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        return Predictive(location=self.decoder(paths), noise=self.σ, joint=True)
+
+
+def _all(mask: Tensor | None) -> Tensor | bool:
+    return True if mask is None else mask

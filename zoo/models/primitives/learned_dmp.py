@@ -1,0 +1,151 @@
+"""What `dmp` has learned: p(θ) of a new movement, the noise, and the timings that it may have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+from zoo.errors import NotFittedError
+from zoo.models.primitives.alignment import durations
+from zoo.models.primitives.cases import Cases
+from zoo.models.primitives.learning import Learned, Learning
+from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.movement_paths import RollOuts
+from zoo.models.primitives.population import Population
+from zoo.movement.rollout import Primitive, Timing
+from zoo.movement.timing import TEMPOS, expected
+from zoo.types import Layout
+
+__all__ = ["COMPONENTS", "Config", "LearnedDmp"]
+
+COMPONENTS = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Settings of :class:`~zoo.models.primitives.dmp.DMP`.
+
+    Times are in units of the movement's duration or period.
+    ``learning`` is ``path``, the conjugate posterior of w under white noise of the path; ``force``,
+    that under white noise of f_target; or ``lwr``, locally weighted regression (61). ``beta`` None
+    is α/4, critical damping. ``gated`` multiplies the forcing term by the phase s. ``period`` of
+    rhythmic movements is in s; None finds it by autocorrelation. ``goal_scaling`` scales the
+    forcing term by (g − y₁) when the goal is changed; joints whose |g − y₁| is below the share
+    ``least_amplitude`` of the range of their path are scaled less: (g − y₁) says little of their
+    size, as Ijspeert et al. (2013) discuss.
+    """
+
+    kind: Literal["discrete", "rhythmic"] = "discrete"
+    learning: Learning = "path"
+    kernels: int = 20
+    alpha: float = 25.0
+    beta: float | None = None
+    gated: bool = False
+    period: float | None = None
+    goal_scaling: bool = True
+    least_amplitude: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse settings that give no attractor or no basis."""
+        if self.kernels < 2:
+            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
+        for name in ("alpha", "beta", "period", "least_amplitude"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive; got {value}")
+        if self.gated and self.kind == "rhythmic":
+            raise ValueError("gated needs a phase that ends; a rhythmic movement has none")
+
+
+class LearnedDmp(nn.Module):
+    """Parameters of :class:`~zoo.models.primitives.dmp.DMP`, and what is possible under them."""
+
+    config_class: ClassVar[type] = Config
+    dtype: ClassVar[torch.dtype] = torch.float64
+
+    mean: Tensor
+    factors: Tensor
+    private: Tensor
+    noise: Tensor
+    ratio: Tensor
+    shares: Tensor
+    information: Tensor
+    scales: Tensor
+    units: Tensor
+    offsets: Tensor
+    reached: Tensor
+
+    def __init__(self, layout: Layout, config: Config) -> None:
+        """A model without data: θ ~ N(0, I)."""
+        super().__init__()
+        self.phased = config.kind == "discrete"
+        self.layout, self.config = layout, config
+        beta = config.alpha / 4 if config.beta is None else config.beta
+        self.primitive = Primitive(config.kind, config.kernels, config.alpha, beta, config.gated)
+        channels, parameters = len(layout.channels), config.kernels + 3
+        eye = torch.eye(parameters, dtype=self.dtype)
+        self._keep("mean", torch.zeros(channels, parameters))
+        self._keep("factors", torch.zeros(channels, parameters, 0))
+        self._keep("private", eye.repeat(channels, 1, 1))
+        self._keep("noise", torch.ones(channels))
+        self._keep("ratio", torch.full((channels,), 1e-2))
+        self._keep("information", torch.ones(()))
+        self._keep("scales", torch.ones(1))
+        for name in ("shares", "units", "offsets", "reached"):
+            self._keep(name, torch.empty(0))
+
+    @property
+    def population(self) -> Population:
+        """p(θ) of a new movement."""
+        return Population(self.mean, self.factors, self.private)
+
+    def _whole(self, frames: int) -> list[Timing]:
+        """Possible timings of a complete movement of ``frames`` frames."""
+        return [Timing(frames - 1.0)] if self.config.kind == "discrete" else self._timings(frames)
+
+    def _timings(self, frames: int) -> list[Timing]:
+        """Possible timings of a movement whose first ``frames`` frames are known."""
+        pairs = zip(self.units.tolist(), self.offsets.tolist(), strict=True)
+        timings = [Timing(unit, offset) for unit, offset in pairs]
+        going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
+        return going or [max(timings, key=lambda t: t.unit)]
+
+    @property
+    def _roll_outs(self) -> RollOuts:
+        return RollOuts(self.primitive, Noise(self.noise, self.ratio))
+
+    def _given(self, timings: Sequence[Timing]) -> Cases:
+        noise, information = Noise(self.noise, self.ratio), float(self.information)
+        return Cases(self.primitive, self.population, noise, information, timings, self.scales)
+
+    def _keep_learned(self, found: Learned) -> None:
+        """Keep p(θ), the noise, and the durations or the period of the movements."""
+        timings = _hypotheses(self.config.kind, found.timings)
+        self._keep("mean", found.population.mean)
+        self._keep("factors", found.population.factors)
+        self._keep("private", found.population.private)
+        self._keep("noise", found.noise.sqrt())
+        self._keep("ratio", found.ratio)
+        alone = torch.as_tensor(found.shares.alone, dtype=self.dtype).expand(len(self.mean))
+        independent = torch.full_like(alone, found.shares.independent)
+        self._keep("shares", torch.stack([alone, independent]))
+        self._keep("information", self.mean.new_tensor(found.information))
+        self._keep("scales", found.scales)
+        self._keep("units", self.mean.new_tensor([t.unit for t in timings]))
+        self._keep("offsets", self.mean.new_tensor([t.offset for t in timings]))
+
+    def _keep(self, name: str, value: Tensor) -> None:
+        self.register_buffer(name, value.detach().to(self.dtype).clone())
+
+    def _check_fitted(self) -> None:
+        if not len(self.units):
+            raise NotFittedError("dmp has not been trained: zoo.fit(model, train) comes first")
+
+
+def _hypotheses(kind: str, timings: Sequence[Timing]) -> list[Timing]:
+    """Timings that a new movement may have: durations seen, or tempos about those seen."""
+    return expected(timings, len(TEMPOS)) if kind == "rhythmic" else durations(timings, COMPONENTS)

@@ -1,0 +1,238 @@
+"""Gaussian mixtures over whole latent paths, and their exact conditioning on the frames seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from zoo.movement.components import alike
+from zoo.movement.gaussian_paths import block_diagonal, cholesky, stationary
+
+__all__ = ["Conditioned", "PathPrior", "Readout"]
+
+CHOICES = {
+    "bandwidth": (0.1, 0.3, 0.6, 0.8, 1.0),
+    "shrinkage": (0.01, 0.1, 0.5),
+    "process": (0.03, 0.3, 1.0),
+}
+LEFT_OUT = 8
+
+
+@dataclass(frozen=True)
+class PathPrior:
+    r"""A mixture over paths z_{1:T} with a component around every known movement.
+
+    p(z) = 1/M Σ_i N(z̄ + √(1−h²)(z_i − z̄), h² ((1−λ) S + λ R) + ν N): S is the covariance of the
+    known paths z_i, R that of independent parameters pushed through the same linear response, N
+    that of the stationary ``residuals`` which the response leaves (West 1993). h = 1 is one
+    Gaussian, a small h a kernel estimate that stays near the movements known. Observed frames are
+    y_t ~ N(z_t, E).
+    """
+
+    paths: Float[Tensor, "movement time latent"]
+    spread: Float[Tensor, "latent time time"]
+    residuals: Float[Tensor, "movement time latent"]
+    observation: Float[Tensor, "latent latent"]
+    bandwidth: float = 0.3
+    shrinkage: float = 0.1
+    process: float = 1.0
+
+    @classmethod
+    def of_responses(
+        cls,
+        response: Float[Tensor, "time parameter"],
+        parameters: Float[Tensor, "movement parameter latent"],
+        variance: Float[Tensor, "parameter latent"],
+        residuals: Float[Tensor, "movement time latent"],
+        observation: Float[Tensor, "latent latent"],
+        shape: Sequence[float] = (),
+    ) -> Self:
+        """The mixture around linear responses; ``shape`` is h, λ and ν where these are known."""
+        return cls(
+            response @ parameters + residuals,
+            torch.einsum("tk,kd,sk->dts", response, variance, response),
+            residuals,
+            observation,
+            *shape,
+        )
+
+    @property
+    def shape(self) -> tuple[float, float, float]:
+        """h, λ and ν."""
+        return self.bandwidth, self.shrinkage, self.process
+
+    @property
+    def means(self) -> Float[Tensor, "movement time latent"]:
+        """Means of the components."""
+        centre = self.paths.mean(0)
+        return centre + math.sqrt(1 - self.bandwidth**2) * (self.paths - centre)
+
+    @property
+    def covariance(self) -> Float[Tensor, "time latent time latent"]:
+        """Covariance that all components share."""
+        movements = len(self.paths)
+        shared = self.shrinkage * torch.einsum("its,ij->tisj", self.spread, _eye(self.observation))
+        if movements > 1:
+            apart = (self.paths - self.paths.mean(0)) / math.sqrt(movements - 1)
+            shared = shared + (1 - self.shrinkage) * torch.einsum("mti,msj->tisj", apart, apart)
+        return self.bandwidth**2 * shared + self.process * stationary(self.residuals)
+
+    def condition(
+        self,
+        seen: Float[Tensor, "*batch time latent"],
+        where: Bool[Tensor, " time"],
+        extra: Float[Tensor, "*batch time latent latent"] | None = None,
+    ) -> Conditioned:
+        """p(z_{1:T} | y_t, t where seen): new means, weights and covariance.
+
+        ``extra`` observation noise of some sequences costs a factorisation of each; without it one
+        factorisation serves all.
+        """
+        time, latent = where.shape[0], self.observation.shape[0]
+        full = self.covariance.reshape(time * latent, time * latent)
+        rows = where.repeat_interleave(latent).nonzero()[:, 0]
+        noise = self.observation if extra is None else self.observation + extra[..., where, :, :]
+        factor = cholesky(full[rows][:, rows] + block_diagonal(noise, int(where.sum())))
+        half = torch.linalg.solve_triangular(factor, full[rows], upper=False)
+        means = self.means.flatten(1)
+        apart = seen.flatten(-2)[..., None, rows] - means[:, rows]
+        white = torch.linalg.solve_triangular(factor, apart.mT, upper=False).mT
+        return Conditioned(
+            means=(means + white @ half).unflatten(-1, (time, latent)),
+            log_weights=torch.log_softmax(-0.5 * white.square().sum(-1), dim=-1),
+            prior=full,
+            known=half,
+        )
+
+    def completed(
+        self,
+        seen: Float[Tensor, "sequence seen latent"],
+        where: Bool[Tensor, "sequence seen"],
+        draws: int,
+    ) -> Float[Tensor, "sample sequence time latent"]:
+        """Joint draws of whole paths given their first frames, ``where`` these were observed."""
+        beyond = self.paths.shape[1] - seen.shape[1]
+        paths = seen.new_empty(draws, len(seen), *self.paths.shape[1:])
+        values = pad(seen.double(), (0, 0, 0, beyond))
+        for rows, frames in alike(pad(where, (0, beyond))):
+            paths[:, rows] = self.condition(values[rows], frames).sample(draws).to(seen)
+        return paths
+
+    def tuned(
+        self, seen: Sequence[int], readout: Readout, without: Callable[[int], PathPrior]
+    ) -> Self:
+        """The h, λ and ν with the best density of each movement's future, left out.
+
+        ``without`` gives the prior of all movements but one. The future is every frame after the
+        first ``seen`` ones, judged frame by frame and channel by channel; the three are chosen in
+        turn. Fewer than three movements leave too little to compare: the defaults stay.
+        """
+        if len(self.paths) < 3:
+            return self
+        rows = torch.linspace(0, len(self.paths) - 1, min(len(self.paths), LEFT_OUT)).round()
+        best, others = self, {i: without(i) for i in rows.long().tolist()}
+        for name in (*CHOICES, "bandwidth"):
+            options = [best._with(name, value) for value in CHOICES[name]]
+            best = max(options, key=lambda prior: prior.left_out(seen, readout, others))
+        return best
+
+    def _with(self, name: str, value: float) -> Self:
+        change: dict[str, Any] = {name: value}
+        return replace(self, **change)
+
+    def left_out(
+        self, seen: Sequence[int], readout: Readout, others: Mapping[int, PathPrior]
+    ) -> float:
+        """Mean log density of movements' futures under the others, of the same h, λ and ν."""
+        h, λ, ν = self.shape
+        total = 0.0
+        for i, rest in others.items():
+            prior = replace(rest, bandwidth=h, shrinkage=λ, process=ν)
+            for k in seen:
+                given = prior.condition(self.paths[i], torch.arange(self.paths.shape[1]) < k)
+                total += float(given.log_density(self.paths[i], readout.of(i))[k:].mean())
+        return total / (len(others) * len(seen))
+
+
+@dataclass(frozen=True)
+class Readout:
+    """What frames show of a path, linear around it: x_t ~ N(J_t (z_t − z_i,t), diag σ²) + x_i,t."""
+
+    jacobian: Float[Tensor, "*movement time channel latent"]
+    std: Float[Tensor, " channel"]
+
+    def of(self, movement: int) -> Readout:
+        """The read-out along one of the movements."""
+        return replace(self, jacobian=self.jacobian[movement])
+
+    def density_of_draws(
+        self, apart: Float[Tensor, "sample time latent"]
+    ) -> Float[Tensor, "time channel"]:
+        """Log density of the truth under draws that lie ``apart`` from its path, as Gaussians."""
+        x = torch.einsum("tci,sti->stc", self.jacobian, apart)
+        std = (x.var(0) + self.std.square()).sqrt()
+        density: Tensor = torch.distributions.Normal(x.mean(0), std).log_prob(torch.zeros_like(std))
+        return density
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """A mixture over paths after frames were seen; all components share the covariance.
+
+    That is the ``prior``'s less what is ``known``, knownᵀ known.
+    """
+
+    means: Float[Tensor, "*batch component time latent"]
+    log_weights: Float[Tensor, "*batch component"]
+    prior: Float[Tensor, "path path"]
+    known: Float[Tensor, "*#batch seen path"]
+
+    @property
+    def covariance(self) -> Float[Tensor, "*#batch path path"]:
+        """Covariance of whole paths, one for all sequences unless each has noise of its own."""
+        covariance: Tensor = self.prior - self.known.mT @ self.known
+        return covariance
+
+    @property
+    def frame_covariances(self) -> Float[Tensor, "time latent latent"]:
+        """Covariance of every frame, of a single sequence."""
+        time, latent = self.means.shape[-2:]
+        blocks = self.prior.unflatten(-1, (time, latent)).unflatten(-3, (time, latent))
+        told = self.known.unflatten(-1, (time, latent))
+        own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+        left: Tensor = own - torch.einsum("rti,rtj->tij", told, told)
+        return left
+
+    def sample(self, draws: int) -> Float[Tensor, "sample *batch time latent"]:
+        """Joint draws of whole paths."""
+        time, latent = self.means.shape[-2:]
+        picks = torch.distributions.Categorical(logits=self.log_weights).sample((draws,))
+        means = self.means.expand(draws, *self.means.shape)
+        index = picks[..., None, None, None].expand(*picks.shape, 1, time, latent)
+        centre = means.gather(-3, index).squeeze(-3)
+        white = torch.randn(*picks.shape, time * latent, dtype=self.prior.dtype)
+        moved = white.movedim(0, -2) @ cholesky(self.covariance).mT
+        path: Tensor = centre + moved.movedim(-2, 0).unflatten(-1, (time, latent))
+        return path
+
+    def log_density(
+        self, path: Float[Tensor, "time latent"], readout: Readout
+    ) -> Float[Tensor, "time channel"]:
+        """Log marginal density of every channel of every frame, read out along a path."""
+        J, each = readout.jacobian, self.frame_covariances
+        variance = torch.einsum("tci,tij,tcj->tc", J, each, J) + readout.std.square()
+        apart = torch.einsum("tci,mti->mtc", J, self.means - path)
+        normal = torch.distributions.Normal(torch.zeros_like(apart), variance.sqrt())
+        joint: Tensor = normal.log_prob(apart) + self.log_weights[:, None, None]
+        return torch.logsumexp(joint, dim=0)
+
+
+def _eye(matrix: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
+    return torch.eye(len(matrix), dtype=matrix.dtype)

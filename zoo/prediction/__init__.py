@@ -1,0 +1,1 @@
+"""One answer for every model: a mixture, its marginals, its labels and units."""

@@ -1,0 +1,1 @@
+"""Trained models: made, trained, asked, mixed and kept."""

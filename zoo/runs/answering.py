@@ -1,0 +1,185 @@
+"""The questions that one trained model, or several as one, answer in the data's own units."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
+
+from numpy.typing import ArrayLike
+
+from zoo.arguments import whole_number
+from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.errors import NotCapableError
+from zoo.evaluation.questions import Setup
+from zoo.evaluation.tasks import Method, corrections
+from zoo.prediction.prediction import Prediction, Recalibration
+from zoo.runs.units import check_unseen, fingerprints, question
+
+__all__ = ["Answers", "Query", "Task"]
+
+Task = Literal["regress", "represent", "reconstruct", "forecast", "impute", "generate"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """One question as it is asked of a run, in the data's units.
+
+    ``horizon`` belongs to forecasts; ``goal``, ``duration``, ``onto``, ``start`` and ``steps`` to
+    :meth:`Answers.generate`.
+    """
+
+    task: Task
+    data: Any
+    draws: int
+    seed: int
+    horizon: int = 0
+    goal: ArrayLike | None = None
+    duration: float = 1.0
+    onto: Sequences | None = None
+    start: int = 0
+    steps: int = 1
+
+
+class Answers(ABC):
+    """Forecast, reconstruct, impute, represent, regress, generate, and calibrate."""
+
+    recalibrations: dict[str, Recalibration]
+    calibrated_on: list[str]
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Name of the entry or entries."""
+        ...
+
+    @property
+    @abstractmethod
+    def capabilities(self) -> tuple[str, ...]:
+        """Tasks that can be asked."""
+        ...
+
+    @property
+    @abstractmethod
+    def fingerprints(self) -> list[str]:
+        """Those of the movements or items that training saw."""
+        ...
+
+    @abstractmethod
+    def uncorrected(self, query: Query) -> Prediction:
+        """The answer without the correction of its bands."""
+        ...
+
+    def forecast(
+        self, data: Sequences, *, horizon: int, draws: int = 200, seed: int = 0
+    ) -> Prediction:
+        """The ``horizon`` frames after the movements in ``data``, which hold the frames observed.
+
+        Raises NotCapableError where the model cannot forecast.
+        """
+        ahead = whole_number(horizon, "horizon", unit="frame")
+        return self._answer(
+            Query(task="forecast", data=data, horizon=ahead, draws=draws, seed=seed)
+        )
+
+    def reconstruct(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """The movements as the model reproduces them."""
+        return self._answer(Query(task="reconstruct", data=data, draws=draws, seed=seed))
+
+    def impute(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """All entries of the movements, those missing (NaN in the arrays) filled in."""
+        return self._answer(Query(task="impute", data=data, draws=draws, seed=seed))
+
+    def represent(self, data: Sequences, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """Latent trajectories of the movements."""
+        return self._answer(Query(task="represent", data=data, draws=draws, seed=seed))
+
+    def regress(self, data: Pairs | ArrayLike, *, draws: int = 200, seed: int = 0) -> Prediction:
+        """Targets of new inputs, given as Pairs or as an array (item, feature)."""
+        return self._answer(Query(task="regress", data=data, draws=draws, seed=seed))
+
+    def generate(
+        self,
+        like: Sequences,
+        *,
+        goal: ArrayLike | None = None,
+        duration: float = 1.0,
+        onto: Sequences | None = None,
+        start: int = 0,
+        steps: int = 1,
+        draws: int = 200,
+        seed: int = 0,
+    ) -> Prediction:
+        """New movements after the demonstrations ``like``.
+
+        ``goal`` is the last frame to reach (of a rhythmic movement the centre to swing about), in
+        the data's units, one for all or one for each movement; ``duration`` stretches time;
+        ``onto`` are the movements to switch to, one for all or one for each, from frame ``start``
+        of the new movement over ``steps`` frames, (89).
+        """
+        self._need("generate")
+        check_record(like, "generate")
+        _check_timing(like, duration, onto is not None, start, steps)
+        return self._answer(
+            Query(
+                task="generate",
+                data=like,
+                goal=goal,
+                duration=duration,
+                onto=onto,
+                start=start,
+                steps=steps,
+                draws=draws,
+                seed=seed,
+            )
+        )
+
+    def calibrate(
+        self,
+        data: Pairs | Sequences,
+        *,
+        method: Method = "conformal",
+        tasks: Sequence[str] | None = None,
+        setup: Setup | None = None,
+    ) -> Self:
+        """Fit and keep a correction of every spread on movements that training never saw.
+
+        ``setup`` says how the tasks will be posed, such as which channels will be missing.
+        """
+        check_record(data, "calibrate")
+        check_unseen(data, self.fingerprints, "calibration")
+        self.recalibrations.update(corrections(self, data, method, tasks, setup))
+        self.calibrated_on.extend(fingerprints(data))
+        return self
+
+    def _answer(self, query: Query) -> Prediction:
+        self._need(query.task)
+        whole_number(query.draws, "draws")
+        found = self.uncorrected(query)
+        asked = question(query.task, query.data)
+        return replace(found, recalibration=self.recalibrations.get(asked))
+
+    def _need(self, task: str) -> None:
+        if task not in self.capabilities:
+            can = ", ".join(self.capabilities) or "nothing"
+            raise NotCapableError(f"{self.name} cannot {task}; it can {can}")
+
+
+def _check_timing(like: Sequences, duration: float, switches: bool, start: int, steps: int) -> None:
+    """Refuse a duration without frames, and a switch outside the new movement."""
+    if not 0 < duration < math.inf:
+        raise ValueError(f"duration must be positive and finite; got {duration}")
+    shortest = int(like.lengths.min())
+    frames = round((shortest - 1) * duration) + 1
+    if frames < 3:
+        raise ValueError(
+            f"duration={duration:g} leaves {frames} of {shortest} frames; at least 3 are needed"
+        )
+    if not switches and (start, steps) != (0, 1):
+        raise ValueError("start and steps are those of a switch: name the movements to go onto")
+    if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
+        raise ValueError(
+            f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
+        )

@@ -1,0 +1,173 @@
+"""A trained model with everything it needs to predict: predict, calibrate, save and load."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.evaluation.questions import Setup
+from zoo.evaluation.scores import score
+from zoo.evaluation.table import Table
+from zoo.evaluation.tasks import Trained, posed
+from zoo.inference.loader import whole
+from zoo.inference.resume.lock import free
+from zoo.prediction.prediction import Prediction
+from zoo.prediction.predictive import Predictive
+from zoo.runs.answering import Answers, Query
+from zoo.runs.assembly import create
+from zoo.runs.disk import load_run, save_run
+from zoo.runs.record import Record
+from zoo.runs.units import Answer, Exchange, check_unseen
+from zoo.streams import seeded
+from zoo.types import Wishes
+
+__all__ = ["Run", "create", "evaluate", "load"]
+
+
+@dataclass(kw_only=True)
+class Run(Record, Answers):
+    """A trained model: predictions in the data's own units, calibration, saving."""
+
+    def __repr__(self) -> str:
+        """Model, data, tasks and calibration in one line."""
+        calibrated = ", ".join(self.recalibrations) or "nothing"
+        return (
+            f"Run of {self.name} on {self.trained_on['name']!r}: "
+            f"can {', '.join(self.capabilities)}; calibrated for {calibrated}"
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the entry."""
+        return self.assembly.entry.name
+
+    @property
+    def model(self) -> nn.Module:
+        """The trained generative model."""
+        return self.assembly.model
+
+    @property
+    def exchange(self) -> Exchange:
+        """Scaling in and out of the model."""
+        return Exchange(assembly=self.assembly, scaler=self.scaler)
+
+    @property
+    def capabilities(self) -> tuple[str, ...]:
+        """Tasks that the model can do."""
+        return self.assembly.entry.capabilities
+
+    @property
+    def fingerprints(self) -> list[str]:
+        """Those of the movements or items that training saw."""
+        found: list[str] = self.trained_on["fingerprints"]
+        return found
+
+    def uncorrected(self, query: Query) -> Prediction:
+        """The answer without the correction of its bands."""
+        if query.task == "regress":
+            return self._regressed(query)
+        latent = query.task == "represent"
+        found, frames = self.exchange.answer(query.data, self._method(query), query.seed)
+        layout, count = self.assembly.layout, found.location.shape[-1]
+        numbers = tuple(f"z_{i + 1}" for i in range(count))
+        ahead = query.task == "forecast"
+        return Prediction(
+            predictive=found if latent else self.exchange.unscaled(found, query.task),
+            axes=("sequence", "time", "latent" if latent else "channel"),
+            names=numbers if latent else layout.channels,
+            units=("",) * count if latent else layout.units,
+            task=query.task,
+            rate=query.data.rate if latent else layout.rate,
+            offset=int(query.data.lengths.max()) if ahead else 0,
+            lengths=None if ahead else frames,
+        )
+
+    def report(self) -> dict[str, Any]:
+        """What the model says of its learned parameters; empty where it says nothing.
+
+        Standard deviations (``…_std…``) are in the data's units, one for each target or channel.
+        """
+        return self.exchange.report()
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the run as a folder of safetensors and JSON.
+
+        Another run there is replaced only with ``overwrite``, else RunExistsError is raised; the
+        same training with a newer calibration always is.
+        """
+        with free(Path(folder)):
+            return save_run(self, Path(folder), overwrite=overwrite)
+
+    def _method(self, query: Query) -> Answer:
+        """The model's method for the task, as it is asked about a batch."""
+        method: Callable[..., Predictive] = getattr(self.model, query.task)
+        draws = query.draws
+        if query.task == "forecast":
+            return lambda batch, posterior, rows: method(
+                batch, posterior, horizon=query.horizon, draws=draws
+            )
+        if query.task == "generate":
+            wishes = self._wishes(query)
+            return lambda batch, posterior, rows: method(
+                batch, posterior, wishes=wishes(rows), draws=draws
+            )
+        return lambda batch, posterior, rows: method(batch, posterior, draws=draws)
+
+    def _wishes(self, query: Query) -> Callable[[list[int]], Wishes]:
+        """The wishes for some of the movements, in the model's scale."""
+        count, onto = len(query.data), query.onto
+        goal = None if query.goal is None else self.exchange.goal(query.goal, count)
+        other = None if onto is None else self.exchange.onto(onto, count)
+        return lambda rows: Wishes(
+            goal=None if goal is None else goal[rows],
+            duration=query.duration,
+            onto=None if other is None else whole(other[rows]),
+            start=query.start,
+            steps=query.steps,
+        )
+
+    def _regressed(self, query: Query) -> Prediction:
+        pairs = self.exchange.scaled(self.exchange.pairs(query.data))
+        with seeded(query.seed, self.assembly.device), torch.no_grad():
+            regress: Callable[..., Predictive] = getattr(self.model, query.task)
+            predictive = regress(pairs.inputs, draws=query.draws)
+        layout = self.assembly.layout
+        return Prediction(
+            predictive=self.exchange.unscaled(predictive, "regress"),
+            axes=("item", "target"),
+            names=layout.channels,
+            units=layout.units,
+            task="regress",
+        )
+
+
+def evaluate(
+    run: Trained,
+    data: Pairs | Sequences,
+    *,
+    tasks: Sequence[str] | None = None,
+    setup: Setup | None = None,
+) -> Table:
+    """Score every task that the model can do, or those named, on data it never saw.
+
+    A task without an answer on these data is a line that says why; the others are scored.
+    """
+    if not hasattr(run, "trained_on"):
+        raise TypeError(f"evaluate scores a run, which zoo.fit gives; got {type(run).__name__}")
+    check_record(data, "evaluate")
+    check_unseen(data, run.trained_on["fingerprints"], "evaluation")
+    check_unseen(data, run.calibrated_on, "evaluation", "calibrated on")
+    found, refused = posed(run, data, tasks, setup)
+    scores = [(t.task, score(t.prediction, t.truth, t.mask, t.groups)) for t in found]
+    return Table.of(run.name, data.name, scores, refused)
+
+
+def load(folder: str | Path, *, device: str = "cpu") -> Run:
+    """A run that :meth:`Run.save` wrote; a damaged or foreign folder is refused with its reason."""
+    return Run(**vars(load_run(Path(folder), device=device)))

@@ -1,0 +1,1 @@
+"""Experiments of chapter 6: movement primitives in latent dynamics."""
