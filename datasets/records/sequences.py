@@ -40,8 +40,7 @@ class Sequences:
     they may run on past the last frame where those of a forecast are known.
     ``rate`` is in Hz; where ``time_normalised``, every movement was stretched to one length, and it
     is that of the mean duration. ``provenance`` is ``own``, ``public``, ``thesis`` or
-    ``simulated``.
-    ``notes`` say what a loader changed in the recording.
+    ``simulated``; ``notes`` say what a loader changed in the recording.
     """
 
     values: Float[Tensor, "sequence time channel"]

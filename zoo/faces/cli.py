@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
-from zoo.faces.options import Data, Figure, Folder, Json, Output, Rate, Seed, Settings, Unseen
+from zoo.faces.options import (
+    Data,
+    Figure,
+    Folder,
+    Json,
+    Output,
+    Rate,
+    Seed,
+    Settings,
+    Unseen,
+    Version,
+)
+from zoo.faces.reproduce import experiment, interruptible, leaderboard
 
 __all__ = ["app", "main"]
 
@@ -32,21 +42,8 @@ app = typer.Typer(
 )
 
 
-def _version(asked: bool) -> None:
-    """Print the version and stop."""
-    if asked:
-        from zoo import __version__
-
-        print(f"movezoo {__version__}")
-        raise typer.Exit
-
-
 @app.callback()
-def root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
+def root(version: Version = False) -> None:
     """Options of the command itself."""
 
 
@@ -143,7 +140,7 @@ def fit(
 
     plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device, rate)
     advice = "repeat the command with --resume to go on from the last checkpoint, if there is one"
-    with _interruptible(advice):
+    with interruptible(advice):
         run = train(plan, run_dir, resume=resume, overwrite=overwrite, progress=not json)
     test = plan.load()[3]
     if output is not None or figure is not None:
@@ -231,83 +228,8 @@ def play_command(
     print(f"Page written to {output}; open it in any browser")
 
 
-@app.command()
-def experiment(
-    identifier: Annotated[
-        str | None, typer.Argument(help="Id, e.g. E6.1; none lists all.", metavar="ID")
-    ] = None,
-    output: Annotated[Path, typer.Option(help="Folder for table and figure.")] = Path("results"),
-    quick: Annotated[bool, typer.Option(help="A short training, to see that it runs.")] = False,
-    json: Json = False,
-) -> None:
-    """Reproduce an experiment of the thesis: its table and figure beside the printed ones."""
-    from zoo.faces.tables import data_table, print_json
-    from zoo.studies import EXPERIMENTS, run_experiment
-
-    if identifier is None:
-        listing = {k: e.summary for k, e in EXPERIMENTS.items()}
-        print_json(listing) if json else Console().print(data_table(listing))
-        return
-    with _interruptible("repeat the command to go on from the last checkpoint"):
-        result = run_experiment(identifier, output, quick=quick, progress=not json)
-    print_json(result.to_json()) if json else Console().print(result)
-
-
-@app.command()
-def leaderboard(
-    name: Annotated[
-        str | None, typer.Argument(help="A protocol; none lists all.", metavar="PROTOCOL")
-    ] = None,
-    models: Annotated[str, typer.Option(help="Entries, a comma between; a+b: an ensemble.")] = "",
-    seeds: Annotated[int, typer.Option(help="Trainings of each entry, seeds 0, 1, …")] = 1,
-    folds: Annotated[
-        int, typer.Option(help="Folds of whole groups: one judged, one calibrates, others train.")
-    ] = 4,
-    data: Annotated[str | None, typer.Option(help="Not a protocol: movements by name.")] = None,
-    seen: Annotated[int, typer.Option(help="With --data: frames observed.")] = 0,
-    horizon: Annotated[int, typer.Option(help="With --data: frames to forecast.")] = 0,
-    hidden: Annotated[
-        str,
-        typer.Option(help="With --data: channels or joints to impute, commas between."),
-    ] = "",
-    by: Annotated[str, typer.Option(help="With --data: group column of the folds.")] = "trial",
-    jobs: Annotated[int, typer.Option(help="Processes, of one thread each.")] = 1,
-    output: Annotated[Path, typer.Option(help="Folder for table and figure.")] = Path("results"),
-    json: Json = False,
-) -> None:
-    """Compare models on movements held out, with intervals over groups and paired tests.
-
-    Example: `zoo leaderboard --data cmu-mocap/35-run --seen 20 --horizon 40 --models mean,promp`
-    """
-    from zoo.faces.tables import data_table, print_json
-    from zoo.studies.leaderboard import PROTOCOLS, run_leaderboard
-    from zoo.studies.leaderboard.own import asked_for
-
-    if name is None and data is None:
-        listing = {k: f"{p.summary}; {p.protocol}" for k, p in PROTOCOLS.items()}
-        print_json(listing) if json else Console().print(data_table(listing))
-        return
-    with _interruptible("repeat the command: what was found is kept under runs/leaderboard"):
-        result = run_leaderboard(
-            asked_for(name, data, seen, horizon, hidden, by),
-            output,
-            models=[m for m in models.split(",") if m],
-            seeds=seeds,
-            folds=folds,
-            jobs=jobs,
-            note=lambda line: print(line, file=sys.stderr),
-        )
-    print_json(result.to_json()) if json else Console().print(result)
-
-
-@contextmanager
-def _interruptible(advice: str) -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        where = str(stop).partition(";")[0] or "interrupted"
-        print(f"zoo: {where}; {advice}", file=sys.stderr)
-        raise typer.Exit(130) from None
+app.command()(experiment)
+app.command()(leaderboard)
 
 
 def _warn(message: Warning | str, *_: object) -> None:

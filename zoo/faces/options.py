@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["Data", "Figure", "Folder", "Json", "Output", "Rate", "Seed", "Settings", "Unseen"]
+__all__ = [
+    "Data",
+    "Figure",
+    "Folder",
+    "Json",
+    "Output",
+    "Rate",
+    "Seed",
+    "Settings",
+    "Unseen",
+    "Version",
+]
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Data = Annotated[
@@ -33,4 +44,18 @@ Output = Annotated[
 ]
 Rate = Annotated[
     float | None, typer.Option("--rate", help="Hz of a file of one's own that has no times.")
+]
+
+
+def _version(asked: bool) -> None:
+    """Print the version and stop."""
+    if asked:
+        from zoo import __version__
+
+        print(f"movezoo {__version__}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
 ]
