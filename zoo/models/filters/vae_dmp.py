@@ -40,8 +40,8 @@ class VaeDmp(LatentPathPrior):
     (80). Choices where the thesis is silent: g(z) = z + MLP(z); ż_1 has a Gaussian prior of its own
     and is recognised from the first two frames; σ = s² + floor.
 
-    The program gives reconstructions, new goals, durations and switches. **Forecasts and imputation
-    are not those of its p(w), p(z^goal)**, (76)–(78), which know neither w nor goal of a new
+    The program gives reconstructions, new goals, durations and switches. Forecasts and imputation
+    are not those of its p(w), p(z^goal), (76)–(78), which know neither w nor goal of a new
     movement: they are those of a model of its own, the *latent path prior*. After training, the
     latents of the training movements become a mixture over latent paths, with what the paths leave
     of the encoded frames as a stationary process in place of ε; it is conditioned exactly on the
