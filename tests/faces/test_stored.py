@@ -15,7 +15,8 @@ def test_every_experiment_of_the_notebooks_can_be_shown(identifier: str) -> None
     """A cell for every number, a point for every finding, and the command."""
     found = stored(identifier)
     page = found._repr_html_()
-    assert page.count("<td ") == sum(len(row) for row in found.payload["rows"])
+    tables = [found.payload, *found.payload.get("sections", ())]
+    assert page.count("<td ") == sum(len(row) for table in tables for row in table["rows"])
     assert page.count("<li>") == len(found.payload["findings"])
     assert f"zoo experiment {identifier}" in page
 

@@ -50,7 +50,7 @@ Rate = Annotated[
 def _version(asked: bool) -> None:
     """Print the version and stop."""
     if asked:
-        from zoo import __version__
+        from zoo.version import __version__
 
         print(f"movezoo {__version__}")
         raise typer.Exit
