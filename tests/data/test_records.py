@@ -216,7 +216,7 @@ def test_resampling_refuses_what_it_cannot_do() -> None:
             data.resampled(**wrong)
     with pytest.raises(ValueError, match="sequence 1 has 1 frame"):
         data.resampled(5)
-    with pytest.raises(ValueError, match="rate must be a positive number, in Hz; got -1.0"):
+    with pytest.raises(ValueError, match=r"rate must be a positive number, in Hz; got -1\.0"):
         data[:1].resampled(rate=-1.0)
     with pytest.raises(ValueError, match="at least 2"):
         data[:1].resampled(1)
