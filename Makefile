@@ -3,10 +3,11 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 CORE := $(VENV)-core
+NOTEBOOKS ?= executed
 export PYTHONSAFEPATH := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: help demo test lint types units notebooks core mutants clean
+.PHONY: help demo test lint types units notebooks core docs mutants clean
 
 help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -32,9 +33,17 @@ notebooks: $(INSTALLED)  ## Execute the notebooks
 core: $(CORE)/.installed  ## Smoke test of the wheel in an environment without extras
 	cd $(CORE) && bin/python ../tests/smoke.py
 
+docs: $(VENV)/.docs  ## Build the site into site/ (NOTEBOOKS=source: without executing them)
+	$(BIN)/python docs/pages.py --notebooks $(NOTEBOOKS)
+	$(BIN)/zensical build --strict --clean
+
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+$(VENV)/.docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	touch $@
 
 $(CORE)/.installed: $(INSTALLED) $(shell git ls-files zoo guides datasets results 2>/dev/null)
@@ -47,4 +56,4 @@ mutants: $(INSTALLED)  ## Break the code on purpose, one line at a time, and cou
 	$(BIN)/python tests/mutants.py
 
 clean:  ## Remove environments and caches
-	rm -rf $(VENV) $(CORE) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(CORE) build dist site docs/models docs/results docs/notebooks *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -29,6 +29,16 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 
+
+def _version(asked: bool) -> None:
+    """Print the version and stop."""
+    if asked:
+        from zoo import __version__
+
+        print(f"movezoo {__version__}")
+        raise typer.Exit
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Data = Annotated[
     str | None,
@@ -45,6 +55,15 @@ Settings = Annotated[
 Folder = Annotated[Path, typer.Argument(help="Folder of a run that `zoo fit` wrote.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of split, parameters and noise.")]
 Figure = Annotated[Path | None, typer.Option("--figure", help="Write a figure to this PNG.")]
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options of the command itself."""
 
 
 @app.command("list")
