@@ -58,6 +58,7 @@ def page(script: Path, home: Path, *, execute: bool) -> str:
     parts = [
         part
         for number, cell in enumerate(notebook.cells)
+        if cell.source.strip()
         for part in _cell(cell, home, f"{script.stem}-{number}")
     ]
     title, rest = parts[0].split("\n", 1) if "\n" in parts[0] else (parts[0], "")
@@ -132,7 +133,9 @@ def _math(formula: str, display: str) -> str:
     tag = re.search(r"\\tag\{([^}]*)\}", formula)
     bare = re.sub(r"\\tag\{[^}]*\}", "", formula).strip().rstrip(",")
     found = convert(bare, display=display)
+    for sized, plain in ((r"\{", "{"), (r"\}", "}"), (r"\|", "‖")):
+        found = found.replace(f">{sized}<", f">{plain}<")
     if display == "inline":
-        return found
+        return f"<span>{found}</span>"
     number = f'<span class="number">({tag[1]})</span>' if tag else ""
     return f'\n\n<div class="formula">{found}{number}</div>\n\n'

@@ -192,5 +192,8 @@ def test_formulas_of_notebooks_become_mathml() -> None:
     """Inline and displayed, with their number."""
     pytest.importorskip("latex2mathml")
     with from_docs("executed") as executed:
-        text = executed.formulas("so $a^2$ and\n$$\\beta = \\frac{\\alpha}{4} \\tag{53}$$\n")  # type: ignore[attr-defined]
-    assert text.count("<math") == 2 and "(53)" in text and "$" not in text
+        text = executed.formulas(
+            "so $a^2$ and\n$$\\beta = \\frac{\\alpha}{4} \\tag{53}$$\n$\\bigl\\| a \\bigr\\|$"
+        )  # type: ignore[attr-defined]
+    assert text.count("<math") == 3 and "(53)" in text
+    assert not set("$\\") & set(text)
