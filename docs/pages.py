@@ -215,7 +215,7 @@ def _costs(chooser: Any, walks: Any) -> str:
         if time is not None:
             trained = f"{seconds[name]:.3g}" if name in seconds else ""
             bands = "yes" if found["bands"]["forecast"] else "no"
-            rows.append((_link(name), trained, error.get(name, ""), f"{time:.2g}", bands))
+            rows.append((_link(name), trained, error.get(name, ""), f"{time:.0f}", bands))
     titles = ("model", "training / s", "MSE / deg²", "one forecast / ms", "bands")
     return table(titles, rows) + _from(
         f"{walks['command']}`, a quarter of its four folds, and `{chooser['command']}"

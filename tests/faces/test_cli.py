@@ -38,6 +38,11 @@ def test_list_needs_no_torch() -> None:
     assert all(name in done.stdout for name in CATALOGUE.names())
 
 
+def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip() == f"movezoo {zoo.__version__}"
+
+
 def test_list_filters_by_capability(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "*dmp*", "--can", "forecast", "--json"]) == 0
     names = [row["name"] for row in json.loads(capsys.readouterr().out)]
