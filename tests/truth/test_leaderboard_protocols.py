@@ -50,6 +50,25 @@ def same(one: Prediction, two: Prediction) -> bool:
     return all(a is b if a is None or b is None else torch.equal(a, b) for a, b in pairs)
 
 
+def test_a_forecast_shows_the_first_frames_and_asks_for_those_after_them() -> None:
+    """SEEN frames of every movement, and of the truth the 7 that follow."""
+    data = movements()
+    question = own_protocol(data, seen=SEEN, horizon=7).question(data)
+    assert torch.equal(question.given.values, data.values[:, :SEEN])
+    assert torch.equal(question.truth, data.values[:, SEEN : SEEN + 7])
+    assert question.horizon == 7 and bool(question.mask.all())
+
+
+def test_an_imputation_hides_the_channels_named_and_asks_for_them() -> None:
+    """The others are observed in every frame."""
+    data = movements()
+    question = own_protocol(data, hidden=HIDDEN).question(data)
+    inside = torch.tensor([c in HIDDEN for c in data.channels])
+    assert torch.equal(question.given.mask, (~inside).expand_as(data.mask))
+    assert torch.equal(question.mask, inside.expand_as(data.mask))
+    assert torch.equal(question.truth[question.mask], data.values[question.mask])
+
+
 @pytest.mark.parametrize("model", QUICK)
 def test_the_default_protocol_sees_nothing_of_what_is_judged(model: str, tmp_path: Path) -> None:
     """Noise for the judged movements' future leaves all predictions their bits."""

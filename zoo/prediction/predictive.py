@@ -109,7 +109,7 @@ class Predictive:
             noise=None if self.noise is None else _widened(self.noise, scale.abs()),
             epistemic=None if self.epistemic is None else _widened(self.epistemic, scale.abs()),
             joint=self.joint,
-            draws=self.redrawn(lambda draws: draws * scale + shift),
+            draws=self.redrawn(lambda draws: draws * scale + shift, self.location.shape[1:]),
         )
 
     def map(self, change: Callable[[Tensor], Tensor]) -> Predictive:
@@ -154,13 +154,19 @@ class Predictive:
             draws=_joined_draws([p._held for p in wide]),
         )
 
-    def redrawn(self, change: Callable[[Tensor], Tensor]) -> Deferred | Tensor | None:
-        """The draws after ``change``, each by itself, deferred where they are."""
+    def redrawn(
+        self, change: Callable[[Tensor], Tensor], shape: Sequence[int] | None = None
+    ) -> Deferred | Tensor | None:
+        """The draws after ``change``, each by itself, deferred where they are.
+
+        ``shape`` is that of a draw after it, where known.
+        """
         if not isinstance(self._held, Deferred):
             return None if self._held is None else change(self._held)
         count, *rest = self._held.shape
-        one = change(self.location.new_zeros(1, *rest))
-        return self._held.map(change, (count, *one.shape[1:]))
+        if shape is None:
+            shape = change(self.location.new_zeros(()).expand(1, *rest)).shape[1:]
+        return self._held.map(change, (count, *shape))
 
     @property
     def _held(self) -> Deferred | Tensor | None:
