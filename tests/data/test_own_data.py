@@ -109,6 +109,22 @@ def test_labels_ride_along() -> None:
     assert Sequences.from_arrays(frame(0), rate=1.0, units="deg").units == ("deg", "deg")
 
 
+def test_units_follow_their_channels() -> None:
+    """To the order asked for, and out of a Dataset whose variables have units of their own."""
+    mixed = pd.DataFrame(VALUES[0], columns=["hip [deg]", "knee [N]"])
+    turned = Sequences.from_arrays(mixed, rate=1.0, channels=["knee", "hip"])
+    assert turned.units == ("N", "deg")
+    np.testing.assert_array_equal(turned.values[0], VALUES[0, :, ::-1])
+    several = [mixed, mixed[["knee [N]", "hip [deg]"]]]
+    assert Sequences.from_arrays(several, rate=1.0).units == ("deg", "N")
+    dataset = xr.Dataset(
+        {"hip": ("time", VALUES[0, :, 0]), "knee": ("time", VALUES[0, :, 1])},
+        coords={"time": np.arange(VALUES.shape[1]) / 10},
+    )
+    dataset["hip"].attrs["units"], dataset["knee"].attrs["units"] = "deg", "N"
+    assert Sequences.from_arrays(dataset).units == ("deg", "N")
+
+
 def test_one_matrix_is_one_movement_and_a_named_column_is_one_channel() -> None:
     assert record().values[:1].equal(Sequences.from_arrays(VALUES[0], rate=30.0).values)
     column = VALUES[0, :, 0]
