@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import pyro
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from zoo.contract.settings import Layers, Positive, settings
 from zoo.nn.mlp import Activation, widths
 from zoo.nn.moments import GaussianNetwork
 from zoo.types import Batch, Layout
@@ -28,19 +28,13 @@ class FrameLatent(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`Amortised`; ``hidden`` are the encoder's layers (() is linear)."""
 
-    hidden: int | tuple[int, ...] = (512,)
+    hidden: Layers = (512,)
     activation: Activation = "relu"
-    encoder_floor: float = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        widths(self.hidden)
-        if not self.encoder_floor > 0:
-            raise ValueError(f"encoder_floor must be positive; got {self.encoder_floor}")
+    encoder_floor: Positive = 1e-4
 
 
 class Amortised(nn.Module):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pyro
@@ -17,6 +16,7 @@ from pyro.infer.autoguide import (
 )
 from torch import Tensor, nn
 
+from zoo.contract.settings import Positive, settings
 from zoo.errors import NotCapableError
 from zoo.types import Batch, Layout
 
@@ -25,16 +25,11 @@ __all__ = ["Automatic", "Config", "Delta", "MultivariateNormal", "Normal"]
 Moments = dict[str, tuple[Tensor, Tensor]]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """``init_scale``: standard deviation from which the training starts, in unconstrained units."""
 
-    init_scale: float = 0.1
-
-    def __post_init__(self) -> None:
-        """Refuse a scale that is none."""
-        if not self.init_scale > 0:
-            raise ValueError(f"init_scale must be positive; got {self.init_scale}")
+    init_scale: Positive = 0.1
 
 
 class Automatic(nn.Module):

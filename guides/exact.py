@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pyro
@@ -11,12 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from zoo.contract.parts import KnowsPosterior
+from zoo.contract.settings import settings
 from zoo.types import Batch, Layout, Sites
 
 __all__ = ["Config", "ExactPosterior"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """No settings: there is nothing to learn."""
 

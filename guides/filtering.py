@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Literal, Protocol
 
 import pyro
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.guides.recurrence import FilteringNoise, NoiseNetwork, Stacked
 from zoo.movement.plan import Plan
 from zoo.nn.mlp import trunk
@@ -51,24 +51,15 @@ class LatentDynamics(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """``hidden`` units in every layer, ``features`` h of g_1, and q(w): a point or a Gaussian."""
 
-    hidden: int = 200
-    features: int = 10
+    hidden: Count = 200
+    features: Count = 10
     weights: Literal["point", "gaussian"] = "point"
-    encoder_std: float = 0.3
-    noise_std: float = 0.3
-
-    def __post_init__(self) -> None:
-        """Refuse empty layers and moments."""
-        for name in ("hidden", "features"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        for name in ("encoder_std", "noise_std"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+    encoder_std: Positive = 0.3
+    noise_std: Positive = 0.3
 
 
 class FilteringGuide(nn.Module):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Layers, Share, settings
 from zoo.nn.mlp import Activation, mlp, widths
 from zoo.types import Batch, Layout
 
@@ -29,7 +30,7 @@ class Imitated(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """``hidden`` layers of the encoder; ``corruption`` the share of inputs set to 0 in training.
 
@@ -38,21 +39,11 @@ class Config:
     without the limb, which independent drops (1) hardly ever do.
     """
 
-    hidden: int | tuple[int, ...] = (36, 20)
+    hidden: Layers = (36, 20)
     activation: Activation = "tanh"
-    corruption: float = 0.1
-    corrupted: float = 0.3
-    together: int = 1
-
-    def __post_init__(self) -> None:
-        """Refuse empty layers and shares that are none."""
-        widths(self.hidden)
-        if not 0 <= self.corruption < 1:
-            raise ValueError(f"corruption must be in [0, 1); got {self.corruption}")
-        if not 0 <= self.corrupted <= 1:
-            raise ValueError(f"corrupted must be in [0, 1]; got {self.corrupted}")
-        if self.together < 1:
-            raise ValueError(f"together must be at least 1; got {self.together}")
+    corruption: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    corrupted: Share = 0.3
+    together: Count = 1
 
 
 class RunDropout(nn.Dropout):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import pyro
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.guides.recurrence import NoiseNetwork, RecurrentNoise
 from zoo.nn.mlp import trunk
 from zoo.nn.moments import GaussianHead
@@ -33,21 +33,13 @@ class StateSpace(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """``hidden`` units of both networks; the first state is read from ``memory`` frames."""
 
-    hidden: int = 200
-    memory: int = 5
-    noise_std: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse empty layers and moments."""
-        for name in ("hidden", "memory"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        if not self.noise_std > 0:
-            raise ValueError(f"noise_std must be positive; got {self.noise_std}")
+    hidden: Count = 200
+    memory: Count = 5
+    noise_std: Positive = 0.5
 
 
 class RecognisedNoise(RecurrentNoise):

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import pyro
 import pyro.distributions as dist
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 import zoo
+from zoo.contract.settings import Count, Positive, settings
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`GPFA`.
 
@@ -22,20 +23,10 @@ class Config:
     of white noise in every latent trajectory; ``noise_floor`` the least σ in scaled units.
     """
 
-    latent_dim: int = 2
-    timescale: float = 0.2
-    innovation: float = 1e-3
-    noise_floor: float = 1e-3
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        if self.latent_dim < 1:
-            raise ValueError(f"latent_dim must be at least 1; got {self.latent_dim}")
-        if not (self.timescale > 0 and self.noise_floor > 0 and 0 < self.innovation < 1):
-            raise ValueError(
-                "timescale and noise_floor must be positive and innovation between 0 and 1; got "
-                f"{self.timescale}, {self.noise_floor}, {self.innovation}"
-            )
+    latent_dim: Count = 2
+    timescale: Positive = 0.2
+    innovation: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    noise_floor: Positive = 1e-3
 
 
 class GPFA(nn.Module):

@@ -211,12 +211,12 @@ def test_too_little_data_is_named() -> None:
         (mean, {"noise_floor": 0.0}, "noise_floor must be positive"),
         (last_value, {"noise_floor": -1.0}, "noise_floor must be positive"),
         (autoregression, {"order": 0}, "order must be at least 1"),
-        (autoregression, {"coupling": "all"}, "coupling must be channel or vector"),
+        (autoregression, {"coupling": "all"}, "coupling must be 'channel' or 'vector'; got 'all'"),
         (autoregression, {"ridge": 0.0}, "ridge must be positive"),
-        (autoregression, {"shrinkage": 1.5}, "shrinkage must be between 0 and 1"),
+        (autoregression, {"shrinkage": 1.5}, "shrinkage must be at most 1; got 1.5"),
         (nearest_neighbour, {"neighbours": 0}, "neighbours must be at least 1"),
         (nearest_neighbour, {"decay": 0.0}, "decay must be positive"),
-        (nearest_neighbour, {"align": "first"}, "align must be none, last, mean, fading or None"),
+        (nearest_neighbour, {"align": "first"}, "'mean' or 'fading'; got 'first'"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(home, settings, message: str) -> None:  # type: ignore[no-untyped-def]

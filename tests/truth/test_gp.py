@@ -198,5 +198,7 @@ def test_data_of_the_wrong_kind_are_refused():
     model = gp.GaussianProcess(data.layout, gp.Config())
     with pytest.raises(TypeError, match="needs Pairs; got str"):
         model.condition("data")
-    with pytest.raises(ValueError, match="noise_floor < noise"):
+    with pytest.raises(ValueError, match="noise must be positive; got 0"):
         gp.Config(noise=0.0)
+    with pytest.raises(ValueError, match="noise_floor must be below noise; got 0.2 and 0.1"):
+        gp.Config(noise_floor=0.2)

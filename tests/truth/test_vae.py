@@ -193,7 +193,7 @@ def test_predictions_have_their_shapes_and_are_joint() -> None:
     ("settings", "message"),
     [
         ({"latent_dim": 0}, "latent_dim must be at least 1; got 0"),
-        ({"hidden": (8, 0)}, "at least 1 unit"),
+        ({"hidden": (8, 0)}, "hidden must be at least 1; got 0"),
         ({"noise_floor": 0.0}, "noise_floor must be positive"),
     ],
 )

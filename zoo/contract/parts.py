@@ -46,8 +46,8 @@ class GenerativeModel(Protocol):
     """
 
     config_class: ClassVar[type]
-    """A frozen, keyword-only dataclass: every field is a setting of ``zoo.create`` with a default,
-    its docstring is a part of the card."""
+    """Made by :func:`zoo.contract.settings.settings`: every field is a setting of
+    ``zoo.create`` with a default, its docstring is a part of the card."""
 
     dtype: ClassVar[torch.dtype]
     """Number type that model, guide and data get: ``torch.float64`` where matrices are factorised,

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from zoo.contract.settings import Count, Positive, settings
 
 __all__ = ["Exact", "Inference", "MarginalLikelihood", "Svi"]
 
 _RAMPS = {"temper_epochs": "c", "warmup_epochs": "β"}
-_LEAST = dict.fromkeys(_RAMPS, 0) | {
-    "epochs": 1,
-    "batch_size": 1,
-    "window": 1,
-    "stride": 1,
-    "patience": 1,
-    "validate_every": 1,
-    "checkpoint_every": 1,
-    "max_steps": 1,
-}
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Svi:
     """Minibatch stochastic variational inference.
 
@@ -34,33 +28,23 @@ class Svi:
     and there are at least 8 groups: a model that learns its noise from new movements needs them.
     """
 
-    epochs: int = 500
-    batch_size: int = 64
-    window: int | None = 1
-    stride: int = 1
-    learning_rate: float = 1e-3
+    epochs: Count = 500
+    batch_size: Count = 64
+    window: Count | None = 1
+    stride: Count = 1
+    learning_rate: Positive = 1e-3
     schedule: Literal["constant", "cosine"] = "cosine"
-    clip: float | None = 10.0
-    temper_epochs: int = 0
-    warmup_epochs: int = 0
-    patience: int | None = 20
-    validate_every: int = 10
-    checkpoint_every: int = 10
-    max_steps: int | None = None
-    kept_out: float = 0.0
+    clip: Positive | None = 10.0
+    temper_epochs: Annotated[int, Field(ge=0)] = 0
+    warmup_epochs: Annotated[int, Field(ge=0)] = 0
+    patience: Count | None = 20
+    validate_every: Count = 10
+    checkpoint_every: Count = 10
+    max_steps: Count | None = None
+    kept_out: Annotated[float, Field(ge=0, lt=1)] = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse settings that no training could run with."""
-        for name, bound in _LEAST.items():
-            value = getattr(self, name)
-            if value is not None and value < bound:
-                raise ValueError(f"{name} must be at least {bound}; got {value}")
-        for name in ("learning_rate", "clip"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive; got {value}")
-        if not 0 <= self.kept_out < 1:
-            raise ValueError(f"kept_out must be at least 0 and below 1; got {self.kept_out}")
+        """Refuse a schedule that does not reach its end."""
         for name, symbol in _RAMPS.items():
             if getattr(self, name) >= self.epochs:
                 raise ValueError(
@@ -95,19 +79,19 @@ class Svi:
         return replace(shorter, validate_every=max(1, math.floor(share * self.validate_every)))
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Exact:
     """Closed form: ``model.condition(train)`` is the whole training."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class MarginalLikelihood:
     """Type-II maximum likelihood of ``model.objective()`` after ``model.condition(train)``."""
 
     optimizer: Literal["l-bfgs", "newton"] = "l-bfgs"
-    iterations: int = 200
-    restarts: int = 1
-    tolerance: float = 1e-6
+    iterations: Count = 200
+    restarts: Count = 1
+    tolerance: Positive = 1e-6
 
 
 Inference = Svi | Exact | MarginalLikelihood

@@ -11,13 +11,13 @@ from typing import Any, get_args, get_type_hints
 
 import pyro
 import torch
-from pydantic import TypeAdapter, ValidationError
 from torch import nn
 
 from zoo.arguments import seed_of
 from zoo.catalogue import CATALOGUE
 from zoo.contract import automatic
 from zoo.contract.registry import Entry, Part, Scaling, load
+from zoo.contract.settings import made
 from zoo.contract.strategies import Inference, Svi
 from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.errors import UnknownNameError
@@ -235,17 +235,6 @@ def _usable(device: str) -> str:
 
 def _validated(entry: Entry, kind: type, values: Mapping[str, Any]) -> Any:
     try:
-        return TypeAdapter(kind).validate_python(dict(values))
-    except ValidationError as error:
-        raise ValueError(f"{entry.name}: {_reason(error)}") from None
-
-
-def _reason(error: ValidationError) -> str:
-    """What is wrong with the first bad setting, in the words of its own check where it has one."""
-    errors = error.errors()
-    first = errors[0]
-    if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
-    name = first["loc"][0]
-    reasons = dict.fromkeys(e["msg"] for e in errors if e["loc"][0] == name)
-    return f"setting {name}: {' or '.join(reasons)}; got {first.get('input')!r}"
+        return made(kind, values)
+    except ValueError as error:
+        raise ValueError(f"{entry.name}: {error}") from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pyro
@@ -11,20 +10,16 @@ import torch
 from torch import Tensor, nn
 
 import zoo
+from zoo.contract.settings import Positive, settings
 
 __all__ = ["Config", "Posture"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of the model: ``floor`` is the least standard deviation, in scaled units."""
 
-    floor: float = 1e-3
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built, and name it."""
-        if not self.floor > 0:
-            raise ValueError(f"floor must be positive; got {self.floor}")
+    floor: Positive = 1e-3
 
 
 class Posture(nn.Module):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pyro
@@ -12,20 +11,16 @@ import torch
 from torch import Tensor, nn
 
 import zoo
+from zoo.contract.settings import Positive, settings
 
 __all__ = ["Config", "Linear"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of the model: ``noise`` is the starting value of σ, in scaled units."""
 
-    noise: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built, and name it."""
-        if not self.noise > 0:
-            raise ValueError(f"noise must be positive; got {self.noise}")
+    noise: Positive = 0.5
 
 
 class Linear(nn.Module):

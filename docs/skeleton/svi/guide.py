@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import pyro
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import zoo
+from zoo.contract.settings import Count, settings
 
 __all__ = ["Config", "FrameGuide", "HasLatent"]
 
@@ -21,11 +21,11 @@ class HasLatent(Protocol):
     latent_dim: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of the guide."""
 
-    hidden: int = 32
+    hidden: Count = 32
 
 
 class FrameGuide(nn.Module):

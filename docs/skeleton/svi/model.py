@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pyro
@@ -12,20 +11,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 import zoo
+from zoo.contract.settings import Count, settings
 
 __all__ = ["Config", "FactorModel"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of the model; every field can be set by ``zoo.create(name, data, field=…)``."""
 
-    latent_dim: int = 2
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built, and name it."""
-        if self.latent_dim < 1:
-            raise ValueError(f"latent_dim must be at least 1; got {self.latent_dim}")
+    latent_dim: Count = 2
 
 
 class FactorModel(nn.Module):

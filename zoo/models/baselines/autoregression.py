@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import pyro.distributions as dist
@@ -12,6 +11,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.contract.readiness import check_fitted
+from zoo.contract.settings import Count, Positive, Share, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogues import interpolated
 from zoo.models.baselines.banded import conditional, precision
@@ -31,7 +31,7 @@ STATE = 1600
 RUNS = 5
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`Autoregression`; None is chosen by cross-validation.
 
@@ -42,27 +42,12 @@ class Config:
     is taken from its diagonal alone.
     """
 
-    order: int | None = None
+    order: Count | None = None
     coupling: Literal["channel", "vector"] | None = None
-    ridge: float | None = None
-    places: int = 8
-    shrinkage: float = 0.1
-    noise_floor: float = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        for name in ("order", "places"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1; got {value}")
-        if self.coupling not in (None, "channel", "vector"):
-            raise ValueError(f"coupling must be channel or vector; got {self.coupling!r}")
-        for name in ("ridge", "noise_floor"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive; got {value}")
-        if not 0 <= self.shrinkage <= 1:
-            raise ValueError(f"shrinkage must be between 0 and 1; got {self.shrinkage}")
+    ridge: Positive | None = None
+    places: Count = 8
+    shrinkage: Share = 0.1
+    noise_floor: Positive = 1e-4
 
 
 class Autoregression(nn.Module):

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from zoo.contract.readiness import check_fitted
+from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogues import carried, interpolated
 from zoo.models.baselines.observation import moments, normal, observe_in_turn
@@ -31,7 +33,7 @@ KERNELS = [
 EXAMPLES = 3
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`KernelRidge`.
 
@@ -40,17 +42,9 @@ class Config:
     are kept for each regression. ``noise_floor`` is in scaled units.
     """
 
-    context: int = 5
-    places: int = 600
-    noise_floor: float = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        for name, least in (("context", 1), ("places", 10)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
-        if not self.noise_floor > 0:
-            raise ValueError(f"noise_floor must be positive; got {self.noise_floor}")
+    context: Count = 5
+    places: Annotated[int, Field(ge=10)] = 600
+    noise_floor: Positive = 1e-4
 
 
 @dataclass(frozen=True)

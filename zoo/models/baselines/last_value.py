@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -11,6 +10,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.contract.readiness import check_fitted
+from zoo.contract.settings import Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.observation import moments, normal, observe_in_turn
 from zoo.movement.demonstrations import movements_of, seen_entries
@@ -20,19 +20,14 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["Config", "LastValue"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`LastValue`.
 
     ``noise_floor`` is the least standard deviation, in scaled units.
     """
 
-    noise_floor: float = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse a floor that is none."""
-        if not self.noise_floor > 0:
-            raise ValueError(f"noise_floor must be positive; got {self.noise_floor}")
+    noise_floor: Positive = 1e-4
 
 
 class LastValue(nn.Module):

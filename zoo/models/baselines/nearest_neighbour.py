@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, get_args
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +11,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.contract.readiness import check_fitted
+from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogue_selection import Choice, Options, Trials, forecast
 from zoo.models.baselines.analogues import carried, error_sums, interpolated
@@ -30,7 +30,7 @@ NEIGHBOURS = (1, 2, 4, 8, 16)
 DECAYS = (2.0, 6.0, 20.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`NearestNeighbour`; None is chosen by cross-validation.
 
@@ -44,27 +44,14 @@ class Config:
     units.
     """
 
-    neighbours: int | None = None
-    context: int | None = None
+    neighbours: Count | None = None
+    context: Count | None = None
     align: Align | None = None
     re_enter: bool | None = None
-    decay: float | None = None
+    decay: Positive | None = None
     leave_out: str | None = None
-    positions: int = 8
-    noise_floor: float = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        for name in ("neighbours", "context", "positions"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1; got {value}")
-        for name in ("decay", "noise_floor"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive; got {value}")
-        if self.align is not None and self.align not in get_args(Align):
-            raise ValueError(f"align must be {', '.join(ALIGNMENTS)} or None; got {self.align!r}")
+    positions: Count = 8
+    noise_floor: Positive = 1e-4
 
 
 class NearestNeighbour(nn.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pyro
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.errors import NotFittedError
 from zoo.models.filters.locally_linear import LocallyLinear
 from zoo.nn.mlp import Activation, mlp
@@ -20,7 +20,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["Config", "Dvbf"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`Dvbf`.
 
@@ -29,23 +29,14 @@ class Config:
     scaled units, never below ``output_floor``.
     """
 
-    latent_dim: int = 8
-    hidden: int = 200
+    latent_dim: Count = 8
+    hidden: Count = 200
     activation: Activation = "relu"
-    bases: int = 16
-    transition_hidden: int = 64
-    noise_scale: float = 0.1
-    output_std: float = 0.3
-    output_floor: float = 1e-3
-
-    def __post_init__(self) -> None:
-        """Refuse empty layers and scales."""
-        for name in ("latent_dim", "hidden", "bases", "transition_hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        for name in ("noise_scale", "output_std", "output_floor"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+    bases: Count = 16
+    transition_hidden: Count = 64
+    noise_scale: Positive = 0.1
+    output_std: Positive = 0.3
+    output_floor: Positive = 1e-3
 
 
 class Dvbf(nn.Module):

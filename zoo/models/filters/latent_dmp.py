@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.movement.lengths import common_length
 from zoo.movement.plan import Plan
 from zoo.movement.response import (
@@ -30,7 +31,7 @@ ALPHA, ALPHA_FRAME = 25.0, 0.4
 BEYOND = 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """``latent_dim`` d', ``hidden`` decoder units of ``activation``, ``kernels``, α (β = α/4).
 
@@ -52,37 +53,26 @@ class Config:
     ``activation``.
     """
 
-    latent_dim: int = 5
-    hidden: int = 200
+    latent_dim: Count = 5
+    hidden: Count = 200
     activation: Activation = "relu"
-    kernels: int = 50
-    alpha: float | None = None
-    transition_hidden: int = 32
-    w_scale: float = 3.0
-    velocity_scale: float = 10.0
-    noise_scale: float = 0.3
+    kernels: Annotated[int, Field(ge=2)] = 50
+    alpha: Positive | None = None
+    transition_hidden: Count = 32
+    w_scale: Positive = 3.0
+    velocity_scale: Positive = 10.0
+    noise_scale: Positive = 0.3
     fixed_noise: bool = False
-    output_std: float = 0.3
-    output_floor: float = 1e-3
+    output_std: Positive = 0.3
+    output_floor: Positive = 1e-3
     goal_scaling: bool = False
-    common_forcing: float | None = None
-    flatness: float = 0.0
+    common_forcing: Positive | None = None
+    flatness: Annotated[float, Field(ge=0)] = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse empty layers and scales."""
-        for name in ("latent_dim", "hidden", "transition_hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}")
-        if self.flatness < 0:
-            raise ValueError(f"flatness must be at least 0; got {self.flatness}")
+        """Refuse a penalty on the slopes of a decoder that is piecewise linear."""
         if self.flatness and self.activation == "relu":
             raise ValueError("flatness needs a smooth activation, such as softplus; got relu")
-        if self.kernels < 2:
-            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
-        scales = ("alpha", "w_scale", "velocity_scale", "noise_scale", "output_std")
-        for name in (*scales, "common_forcing"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
 
 
 class LatentDmp(nn.Module):

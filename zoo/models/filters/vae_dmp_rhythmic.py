@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
+from typing import Annotated, ClassVar
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 
+from zoo.contract.settings import Positive, settings
 from zoo.datasets.records import Sequences
 from zoo.errors import NotFittedError
 from zoo.models.filters import latent_dmp
@@ -31,7 +33,7 @@ GRID, COARSE = (48, 9), (16, 5)
 SETTLING = 40.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config(latent_dmp.Config):
     """As of :class:`~zoo.models.filters.vae_dmp.VaeDmp`, but α is 0.4 a frame where it is None.
 
@@ -39,17 +41,13 @@ class Config(latent_dmp.Config):
     a movement's tempo over the usual one has the prior N(0, ``tempo_scale``²).
     """
 
-    kernels: int = 12
-    period: float | None = None
-    tempo_scale: float = 0.1
+    kernels: Annotated[int, Field(ge=2)] = 12
+    period: Positive | None = None
+    tempo_scale: Positive = 0.1
 
     def __post_init__(self) -> None:
         """Refuse what belongs to discrete movements."""
         super().__post_init__()
-        for name in ("period", "tempo_scale"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive; got {value}")
         if self.goal_scaling:
             raise ValueError("goal_scaling is for movements with an end; rhythmic ones have none")
 

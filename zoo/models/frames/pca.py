@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pyro
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotFittedError
 from zoo.inference.factors import Factors, closed_form, expectation_maximisation
@@ -20,7 +20,7 @@ from zoo.types import Batch, Layout, Posterior, Sites
 __all__ = ["PCA", "Config"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`PCA`.
 
@@ -28,23 +28,10 @@ class Config:
     ``em_iterations`` and ``em_tolerance`` (nats a seen entry) end EM where entries are missing.
     """
 
-    latent_dim: int = 5
-    noise_floor: float = 1e-4
-    em_iterations: int = 2000
-    em_tolerance: float = 1e-7
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        if self.latent_dim < 1 or self.em_iterations < 1:
-            raise ValueError(
-                "latent_dim and em_iterations must be at least 1; "
-                f"got {self.latent_dim}, {self.em_iterations}"
-            )
-        if not (self.noise_floor > 0 and self.em_tolerance > 0):
-            raise ValueError(
-                "noise_floor and em_tolerance must be positive; "
-                f"got {self.noise_floor}, {self.em_tolerance}"
-            )
+    latent_dim: Count = 5
+    noise_floor: Positive = 1e-4
+    em_iterations: Count = 2000
+    em_tolerance: Positive = 1e-7
 
 
 class PCA(nn.Module):

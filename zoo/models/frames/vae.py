@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Layers, Positive, settings
 from zoo.errors import NotFittedError
 from zoo.models.frames.denoising import conditional_draws
 from zoo.nn.mlp import Activation, widths
@@ -21,7 +22,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["VAE", "Config"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`VAE`.
 
@@ -31,22 +32,13 @@ class Config:
     units. ``chains`` and ``burn_in`` run the Markov chain that fills missing entries.
     """
 
-    latent_dim: int = 5
-    hidden: int | tuple[int, ...] = (512,)
+    latent_dim: Count = 5
+    hidden: Layers = (512,)
     activation: Activation = "relu"
     noise: Noise = "state"
-    noise_floor: float = 1e-2
-    chains: int = 20
-    burn_in: int = 20
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        widths(self.hidden)
-        for name, least in (("latent_dim", 1), ("chains", 1), ("burn_in", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
-        if not self.noise_floor > 0:
-            raise ValueError(f"noise_floor must be positive; got {self.noise_floor}")
+    noise_floor: Positive = 1e-2
+    chains: Count = 20
+    burn_in: Annotated[int, Field(ge=0)] = 20
 
 
 class VAE(nn.Module):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pyro
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from zoo.contract.settings import Count, Layers, Positive, settings
 from zoo.errors import NotFittedError
 from zoo.nn.mlp import Activation, widths
 from zoo.nn.moments import GaussianNetwork, Noise
@@ -20,7 +20,7 @@ from zoo.types import Batch, Layout, Posterior
 __all__ = ["Config", "VAEDynamics"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`VAEDynamics`.
 
@@ -29,19 +29,11 @@ class Config:
     channel, or one ``shared`` by all; ``noise_floor`` the least σ in scaled units.
     """
 
-    latent_dim: int = 5
-    hidden: int | tuple[int, ...] = (512,)
+    latent_dim: Count = 5
+    hidden: Layers = (512,)
     activation: Activation = "relu"
     noise: Noise = "state"
-    noise_floor: float = 1e-2
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        widths(self.hidden)
-        if self.latent_dim < 1:
-            raise ValueError(f"latent_dim must be at least 1; got {self.latent_dim}")
-        if not self.noise_floor > 0:
-            raise ValueError(f"noise_floor must be positive; got {self.noise_floor}")
+    noise_floor: Positive = 1e-2
 
 
 class VAEDynamics(nn.Module):

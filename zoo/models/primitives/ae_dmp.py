@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor, nn
 
 from zoo.contract.readiness import need
+from zoo.contract.settings import Count, Layers, Positive, Share, settings
 from zoo.errors import NotFittedError
 from zoo.models.primitives.imitator import Imitator
 from zoo.movement.components import ramp
@@ -29,7 +30,7 @@ __all__ = ["AeDmp", "Config"]
 PRIORS = {"normal": dist.Normal, "laplace": dist.Laplace}
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`AeDmp`.
 
@@ -42,31 +43,19 @@ class Config:
     steps k of §5.3.4; ``noise_std`` where σ starts, never below ``noise_floor``, in scaled units.
     """
 
-    latent_dim: int = 5
-    hidden: int | tuple[int, ...] = (36, 20)
+    latent_dim: Count = 5
+    hidden: Layers = (36, 20)
     activation: Activation = "tanh"
-    kernels: int = 20
-    alpha: float | None = None
-    penalty: float = 1e-3
-    pretraining: float = 0.3
+    kernels: Annotated[int, Field(ge=2)] = 20
+    alpha: Positive | None = None
+    penalty: Positive = 1e-3
+    pretraining: Share = 0.3
     prior: Literal["normal", "laplace"] = "normal"
-    prior_scale: float = 1.0
-    weight_scale: float | None = None
-    chain: int = 4
-    noise_std: float = 0.3
-    noise_floor: float = 1e-3
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        widths(self.hidden)
-        for name, least in (("latent_dim", 1), ("kernels", 2), ("chain", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}; got {getattr(self, name)}")
-        for name in ("penalty", "prior_scale", "weight_scale", "noise_std", "noise_floor"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
-        if not 0 <= self.pretraining <= 1:
-            raise ValueError(f"pretraining must be in [0, 1]; got {self.pretraining}")
+    prior_scale: Positive = 1.0
+    weight_scale: Positive | None = None
+    chain: Count = 4
+    noise_std: Positive = 0.3
+    noise_floor: Positive = 1e-3
 
 
 class AeDmp(nn.Module):

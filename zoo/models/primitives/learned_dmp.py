@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
+from zoo.contract.settings import Positive, settings
 from zoo.errors import NotFittedError
 from zoo.models.primitives.alignment import durations
 from zoo.models.primitives.cases import Cases
@@ -25,7 +26,7 @@ __all__ = ["COMPONENTS", "Config", "LearnedDmp"]
 COMPONENTS = 16
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`~zoo.models.primitives.dmp.DMP`.
 
@@ -41,22 +42,16 @@ class Config:
 
     kind: Literal["discrete", "rhythmic"] = "discrete"
     learning: Learning = "path"
-    kernels: int = 20
-    alpha: float = 25.0
-    beta: float | None = None
+    kernels: Annotated[int, Field(ge=2)] = 20
+    alpha: Positive = 25.0
+    beta: Positive | None = None
     gated: bool = False
-    period: float | None = None
+    period: Positive | None = None
     goal_scaling: bool = True
-    least_amplitude: float = 0.5
+    least_amplitude: Positive = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse settings that give no attractor or no basis."""
-        if self.kernels < 2:
-            raise ValueError(f"kernels must be at least 2; got {self.kernels}")
-        for name in ("alpha", "beta", "period", "least_amplitude"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive; got {value}")
+        """Refuse a gate without a phase that ends."""
         if self.gated and self.kind == "rhythmic":
             raise ValueError("gated needs a phase that ends; a rhythmic movement has none")
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
+from typing import Annotated, ClassVar
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from pyro import poutine
 from torch import Tensor, nn
 from torch.distributions.transforms import ReshapeTransform
 from torch.nn import functional
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.frames import pca
 from zoo.models.primitives import dmp
@@ -31,19 +33,15 @@ from zoo.types import Batch, Layout, Posterior, Sites, Wishes
 __all__ = ["Config", "PcaDmp"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`PcaDmp`: the components kept, and the primitive of each."""
 
-    latent_dim: int = 5
-    noise_floor: float = 1e-4
-    kernels: int = 20
-    alpha: float = 25.0
+    latent_dim: Count = 5
+    noise_floor: Positive = 1e-4
+    kernels: Annotated[int, Field(ge=2)] = 20
+    alpha: Positive = 25.0
     goal_scaling: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse what either part refuses."""
-        _ = self.pca, self.dmp
 
     @property
     def pca(self) -> pca.Config:

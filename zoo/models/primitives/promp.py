@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from pyro import poutine
 from torch import Tensor, nn
 from torch.nn import functional
 
 from zoo.contract.readiness import check_fitted
+from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.primitives.cross_fitting import Choice, Prepared, choose, inflation
 from zoo.models.primitives.hypotheses import Hypotheses, Posteriors
@@ -41,7 +42,7 @@ SMOOTH = 1.0
 SCALES = {"discrete": 16, "rhythmic": 4}
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`ProMP`.
 
@@ -55,30 +56,13 @@ class Config:
     """
 
     kind: Literal["discrete", "rhythmic"] = "discrete"
-    kernels: int = 15
-    synergies: int | None = None
-    period: float | None = None
-    shrinkage: float | None = None
-    information: float | None = None
-    em_iterations: int = 20
-    em_tolerance: float = 1e-4
-
-    def __post_init__(self) -> None:
-        """Refuse settings without a meaning."""
-        if self.kind not in ("discrete", "rhythmic"):
-            raise ValueError(f"kind must be discrete or rhythmic; got {self.kind!r}")
-        for name, least in (("kernels", 2), ("synergies", 1), ("em_iterations", 1)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be at least {least}; got {value}")
-        for name in ("period", "em_tolerance"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"{name} must be positive; got {value}")
-        if self.shrinkage is not None and not 0 < self.shrinkage < 1:
-            raise ValueError(f"shrinkage must be between 0 and 1; got {self.shrinkage}")
-        if self.information is not None and not 0 < self.information <= 1:
-            raise ValueError(f"information must be above 0, at most 1; got {self.information}")
+    kernels: Annotated[int, Field(ge=2)] = 15
+    synergies: Count | None = None
+    period: Positive | None = None
+    shrinkage: Annotated[float, Field(gt=0, lt=1)] | None = None
+    information: Annotated[float, Field(gt=0, le=1)] | None = None
+    em_iterations: Count = 20
+    em_tolerance: Positive = 1e-4
 
 
 class ProMP(nn.Module):

@@ -12,7 +12,7 @@ from torch.func import functional_call
 
 from zoo.models.processes.kernels import squared_distances, squared_exponential
 
-__all__ = ["KERNELS", "Name", "check_kernel", "learned_shape", "stationary"]
+__all__ = ["KERNELS", "Name", "learned_shape", "stationary"]
 
 Name = Literal["squared-exponential", "matern12", "matern32", "matern52", "rational-quadratic"]
 KERNELS: dict[str, float | None] = {
@@ -76,15 +76,6 @@ def learned_shape(name: Name, *size: int) -> nn.Parameter | None:
     if name != "rational-quadratic":
         return None
     return nn.Parameter(torch.zeros(size, dtype=torch.float64))
-
-
-def check_kernel(name: str) -> None:
-    """Refuse a name that no kernel has.
-
-    >>> check_kernel("matern52")
-    """
-    if name not in KERNELS:
-        raise ValueError(f"kernel is one of {', '.join(KERNELS)}; got {name!r}")
 
 
 @cache

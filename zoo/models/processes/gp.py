@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 
+from zoo.contract.settings import Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotFittedError, TooManyItemsError
-from zoo.models.processes.covariances import Name, check_kernel, learned_shape, stationary
+from zoo.models.processes.covariances import Name, learned_shape, stationary
 from zoo.models.processes.evidence import dense, pairs_of, patterns
 from zoo.models.processes.gaussian import joint_draws, white_posterior
 from zoo.models.processes.kernels import median_distance, squared_distances, squared_exponential
@@ -26,7 +27,7 @@ SHARE = 1e-2
 HELD, HELD_A_KERNEL = 10, 4
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`GaussianProcess`.
 
@@ -40,22 +41,17 @@ class Config:
     kernel: Name = "squared-exponential"
     shared: bool = False
     ard: bool = False
-    noise: float = 0.1
-    noise_floor: float = 1e-6
-    joint_items: int = 512
-    memory: float = 8.0
+    noise: Positive = 0.1
+    noise_floor: Positive = 1e-6
+    joint_items: Annotated[int, Field(ge=0)] = 512
+    memory: Positive = 8.0
 
     def __post_init__(self) -> None:
-        """Refuse settings that have no meaning."""
-        check_kernel(self.kernel)
-        if not 0 < self.noise_floor < self.noise:
+        """Refuse a floor above the noise."""
+        if not self.noise_floor < self.noise:
             raise ValueError(
-                f"0 < noise_floor < noise is needed; got {self.noise_floor} and {self.noise}"
+                f"noise_floor must be below noise; got {self.noise_floor} and {self.noise}"
             )
-        if self.joint_items < 0:
-            raise ValueError(f"joint_items must not be negative; got {self.joint_items}")
-        if not self.memory > 0:
-            raise ValueError(f"memory must be positive, in GB; got {self.memory}")
 
 
 class _Group(NamedTuple):

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor
 
+from zoo.contract.settings import Count, Positive, settings
 from zoo.errors import FewerInducingWarning, NoiseDivergenceWarning
 from zoo.models.processes.collapsed import Collapsed
-from zoo.models.processes.covariances import Name, check_kernel
+from zoo.models.processes.covariances import Name
 from zoo.models.processes.kernels import squared_distances
 from zoo.types import Batch, Layout
 
 __all__ = ["Config", "Training", "View", "warn_of_divergence"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Config:
     """Settings of :class:`~zoo.models.processes.sparse_gp.SparseGaussianProcess`.
 
@@ -39,34 +41,24 @@ class Config:
 
     bound: Literal["fitc", "vfe"] = "fitc"
     kernel: Name = "squared-exponential"
-    inducing: int | float = 0.17
-    most_inducing: int = 1000
+    inducing: Annotated[int | float, Field(gt=0)] = 0.17
+    most_inducing: Count = 1000
     learn_inducing: bool = False
     ard: bool = False
-    noise: float = 0.1
-    noise_floor: float = 1e-6
-    jitter: float = 1e-8
+    noise: Positive = 0.1
+    noise_floor: Positive = 1e-6
+    jitter: Annotated[float, Field(ge=0)] = 1e-8
     compare: bool = True
-    divergence: float = 2.0
-    joint_items: int = 512
+    divergence: Annotated[float, Field(gt=1)] = 2.0
+    joint_items: Annotated[int, Field(ge=0)] = 512
 
     def __post_init__(self) -> None:
-        """Refuse settings that have no meaning."""
-        if self.bound not in ("fitc", "vfe"):
-            raise ValueError(f"bound is fitc or vfe; got {self.bound!r}")
-        check_kernel(self.kernel)
-        whole = float(self.inducing).is_integer()
-        if self.inducing <= 0 or (self.inducing > 1 and not whole):
+        """Refuse what is neither a number nor a fraction, and a floor above the noise."""
+        if self.inducing > 1 and not float(self.inducing).is_integer():
             raise ValueError(f"inducing is a number or a fraction up to 1; got {self.inducing}")
-        if self.most_inducing < 1:
-            raise ValueError(f"most_inducing must be at least 1; got {self.most_inducing}")
-        if not 0 < self.noise_floor < self.noise:
+        if not self.noise_floor < self.noise:
             raise ValueError(
-                f"0 < noise_floor < noise is needed; got {self.noise_floor} and {self.noise}"
-            )
-        if self.jitter < 0 or self.divergence <= 1:
-            raise ValueError(
-                f"jitter ≥ 0 and divergence > 1 are needed; got {self.jitter}, {self.divergence}"
+                f"noise_floor must be below noise; got {self.noise_floor} and {self.noise}"
             )
 
     def count(self, items: int) -> int:
