@@ -15,6 +15,8 @@ __all__ = [
     "NotCapableError",
     "NotFittedError",
     "NotRegisteredError",
+    "OtherPeopleWarning",
+    "OtherQuestionWarning",
     "OtherTrainingError",
     "PosteriorCollapseWarning",
     "RunExistsError",
@@ -118,6 +120,14 @@ class PosteriorCollapseWarning(UserWarning):
 
 class UnlikeUnitsWarning(UserWarning):
     """Channels of several units are scaled by one number."""
+
+
+class OtherQuestionWarning(UserWarning):
+    """Bands are asked for a question that they were not calibrated for."""
+
+
+class OtherPeopleWarning(UserWarning):
+    """Bands are asked for people who were not among those that they were calibrated on."""
 
 
 class NotCalibratedWarning(UserWarning):

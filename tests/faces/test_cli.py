@@ -194,7 +194,7 @@ def test_too_few_movements_to_calibrate_on_is_a_warning(
     assert main(["fit", "mean", "--data", "robot-arm", "--run-dir", str(tmp_path)]) == 0
     error = capsys.readouterr().err
     assert "zoo: warning: the calibration part holds 1 movement" in error and ".py" not in error
-    assert zoo.load(tmp_path).recalibrations == {}
+    assert not zoo.load(tmp_path).calibration
 
 
 def test_settings_are_numbers_lists_and_words(tmp_path: Path) -> None:

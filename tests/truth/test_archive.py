@@ -61,7 +61,27 @@ def forged_index(folder: Path, **change: object) -> Path:
 def test_what_is_not_changed_loads(parts: tuple[Meta, Tensors], tmp_path: Path) -> None:
     """The forger of these tests is not what makes loading fail."""
     again = zoo.load(forged_index(forged(tmp_path / "run", *parts)))
-    assert set(again.recalibrations) == {"reconstruct"}
+    assert again.calibration.tasks == ("reconstruct",)
+
+
+def test_a_run_saved_without_its_questions_keeps_its_bands(
+    run: zoo.Run, parts: tuple[Meta, Tensors], tmp_path: Path
+) -> None:
+    """Corrections were kept by task alone before: they are read, as of unknown questions."""
+    meta, tensors = parts
+    (state,) = meta["calibration"]
+    old = {k: v for k, v in state.items() if k in ("kind", "groups")}
+    names = {k: k.replace("calibration.0", "recalibration.reconstruct") for k in tensors}
+    body = {k: v for k, v in meta.items() if k != "calibration"}
+    again = zoo.load(
+        forged(
+            tmp_path / "run",
+            {**body, "recalibrations": {"reconstruct": old}},
+            {names[k]: v for k, v in tensors.items()},
+        )
+    )
+    one, two = (r.reconstruct(movements()[4:]).interval(0.9) for r in (run, again))
+    assert torch.equal(one[0], two[0]) and torch.equal(one[1], two[1])
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -145,6 +165,7 @@ WRONG: list[tuple[str, object]] = [
     *((key, bad) for key in ("seed", "seconds") for bad in (None, "x", [1], {"a": 1})),
     *((key, bad) for key in ("history", "versions") for bad in (None, "x", [1], {"a": 1})),
     *(("trained_on", bad) for bad in (None, "x", {}, {"name": "a", "fingerprints": 5})),
+    *(("calibration", bad) for bad in (None, {"a": 1}, [{"kind": "scale"}])),
     *(("recalibrations", bad) for bad in (None, [1], {"reconstruct": {"kind": "other"}})),
     ("entry", "os:system"),
     ("entry", "gp"),

@@ -13,6 +13,7 @@ from support import CHANNELS, assembly_of, data_of, movements, run_of
 import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Pairs, Sequences
+from zoo.evaluation.calibration.calibration import Calibration
 from zoo.evaluation.questions import Setup
 from zoo.prediction.prediction import Prediction
 from zoo.runs.units import fingerprints
@@ -54,7 +55,7 @@ def test_a_movement_is_answered_as_it_is_alone(name: str) -> None:
 @pytest.mark.parametrize("name", ["pca", "mean", "vae", "ar"])
 def test_ragged_movements_are_scored_and_calibrated(name: str, method: str) -> None:
     """Frames beyond an end have no spread: they count nowhere and warn of nothing."""
-    run = replace(run_of(name), recalibrations={})
+    run = replace(run_of(name), calibration=Calibration())
     run.calibrate(ragged(), method=method, setup=QUICK)
     for row in zoo.evaluate(run, ragged(), setup=QUICK).rows:
         assert all(np.isfinite(e.value) for e in row.scores.values.values()), row.task
@@ -64,12 +65,13 @@ def test_ragged_movements_are_scored_and_calibrated(name: str, method: str) -> N
 @pytest.mark.filterwarnings("ignore:.* were trained on")
 @pytest.mark.parametrize("method", ["conformal", "isotonic", "scale"])
 def test_a_ragged_answer_is_finite_everywhere(method: str) -> None:
-    run = replace(run_of("pca"), recalibrations={})
+    run = replace(run_of("pca"), calibration=Calibration())
     answer = run.calibrate(ragged(), method=method).reconstruct(ragged())
     parts = [answer.mean, answer.std, *answer.interval(0.9), answer.cdf(answer.mean)]
     assert all(bool(part.isfinite().all()) for part in [*parts, answer.sample(40)])
 
 
+@pytest.mark.filterwarnings("ignore::zoo.errors.OtherPeopleWarning")
 @pytest.mark.parametrize("name", ["pca", "gp"])
 def test_what_was_trained_on_is_noticed(name: str) -> None:
     data = data_of(CATALOGUE[name])

@@ -48,7 +48,7 @@ def test_what_cannot_be_calibrated_is_a_warning(whole: zoo.Run) -> None:
     setup = zoo.Setup(seen=10, draws=20)
     with pytest.warns(NotCalibratedWarning, match="reconstruct has no answer .* stays uncal"):
         whole.calibrate(unseen, method="scale", setup=setup)
-    assert "forecast" in whole.recalibrations and "reconstruct" not in whole.recalibrations
+    assert "forecast" in whole.calibration.tasks and "reconstruct" not in whole.calibration.tasks
 
 
 def test_named_channels_are_hidden_and_no_others() -> None:

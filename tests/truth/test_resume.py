@@ -186,7 +186,7 @@ def test_a_finished_run_comes_back_as_fit_gave_it(tmp_path: Path) -> None:
     run = zoo.fit(zoo.create("mean", TRAIN), TRAIN, run_dir=tmp_path)
     run.calibrate(movements()[6:], method="scale").save(tmp_path)
     again = zoo.fit(zoo.create("mean", TRAIN), TRAIN, run_dir=tmp_path, resume="auto")
-    assert again.recalibrations == {} and zoo.load(tmp_path).recalibrations
+    assert not again.calibration and zoo.load(tmp_path).calibration
 
 
 def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
 from zoo.datasets.records import Groups, Pairs, Sequences
-from zoo.errors import NotCalibratedWarning, UnanswerableError, UnknownNameError
-from zoo.evaluation.calibration.recalibration import recalibrate
+from zoo.errors import UnanswerableError, UnknownNameError
 from zoo.evaluation.questions import NEEDS, Question, Setup, ask
-from zoo.prediction.prediction import Prediction, Recalibration
+from zoo.prediction.prediction import Prediction
 
 __all__ = [
-    "Method",
     "Predictor",
     "Trained",
     "Trial",
     "answered",
-    "corrections",
     "posed",
+    "tasks_of",
     "trials",
 ]
-
-Method = Literal["conformal", "isotonic", "scale"]
 
 
 class Predictor(Protocol):
@@ -122,7 +117,7 @@ def posed(
     found: list[Trial] = []
     refused: dict[str, UnanswerableError] = {}
     how = setup or Setup()
-    for name in _names(run, tasks):
+    for name in tasks_of(run, tasks):
         try:
             found.append(_trial(run, ask(name, data, how), how))
         except UnanswerableError as error:
@@ -132,8 +127,8 @@ def posed(
     return found, {name: str(error) for name, error in refused.items()}
 
 
-def _names(run: Predictor, tasks: Sequence[str] | None) -> list[str]:
-    """Tasks to pose; those that the model has not are named."""
+def tasks_of(run: Predictor, tasks: Sequence[str] | None = None) -> list[str]:
+    """Tasks to pose: those named, all of which the model must have, or all that it has."""
     names = [task for task, need in NEEDS.items() if need in run.capabilities]
     if tasks is not None:
         unknown = [t for t in tasks if t not in names]
@@ -143,28 +138,6 @@ def _names(run: Predictor, tasks: Sequence[str] | None) -> list[str]:
             )
         names = list(tasks)
     return names
-
-
-def corrections(
-    run: Predictor,
-    data: Pairs | Sequences,
-    method: Method,
-    tasks: Sequence[str] | None = None,
-    setup: Setup | None = None,
-) -> dict[str, Recalibration]:
-    """A correction of the spread for every task, fitted on ``data``.
-
-    A task without an answer on these data stays as it is, with a NotCalibratedWarning.
-    """
-    found, refused = posed(run, data, tasks, setup)
-    for task, reason in refused.items():
-        told = f"{task} has no answer on the calibration data and stays uncalibrated: {reason}"
-        warnings.warn(told, NotCalibratedWarning, stacklevel=3)
-    return {
-        trial.task: recalibrate(method, trial.prediction.raw, trial.truth, trial.mask, trial.groups)
-        for trial in found
-        if trial.prediction.has_spread
-    }
 
 
 def _trial(run: Predictor, question: Question, setup: Setup) -> Trial:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import Any, Literal, Protocol, Self
+from typing import Literal, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -40,8 +40,8 @@ class Recalibration(Protocol):
         """The corrected distribution where it is still a Gaussian mixture, else None."""
         ...
 
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """What a file must keep of it: JSON with its ``kind``, and tensors."""
+    def rows(self, index: slice | Tensor) -> Recalibration:
+        """The correction of some sequences or items."""
         ...
 
 
@@ -219,8 +219,12 @@ class Prediction:
     def rows(self, index: Tensor) -> Self:
         """The prediction of some sequences or items, by their numbers or by a boolean each."""
         where = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        lengths = None if self.lengths is None else self.lengths[where]
-        return replace(self, predictive=self.predictive.rows(where), lengths=lengths)
+        return replace(
+            self,
+            predictive=self.predictive.rows(where),
+            lengths=None if self.lengths is None else self.lengths[where],
+            recalibration=None if self.recalibration is None else self.recalibration.rows(where),
+        )
 
     def recalibrated(self, recalibration: Recalibration) -> Self:
         """This prediction with its spread corrected."""

@@ -112,6 +112,27 @@ class Predictive:
             draws=self.redrawn(lambda draws: draws * scale + shift, self.location.shape[1:]),
         )
 
+    def stretched(self, factor: Float[Tensor, "..."]) -> Predictive:
+        """The distribution stretched about its mean; ``factor`` is broadcast over its entries.
+
+        >>> p = Predictive(location=torch.tensor([[0.0], [2.0]]), noise=torch.ones(1))
+        >>> p.stretched(torch.tensor(2.0)).location.flatten().tolist()
+        [-1.0, 3.0]
+        """
+        mean = self.location.mean(0)
+
+        def widened(part: Tensor) -> Tensor:
+            moved: Tensor = mean + factor * (part - mean)
+            return moved
+
+        return Predictive(
+            location=widened(self.location),
+            noise=None if self.noise is None else self.noise * factor,
+            epistemic=None if self.epistemic is None else self.epistemic * factor,
+            joint=self.joint,
+            draws=self.redrawn(widened, mean.shape),
+        )
+
     def map(self, change: Callable[[Tensor], Tensor]) -> Predictive:
         """The same ``change`` of location, noise, epistemic and draws: which entries, and where.
 

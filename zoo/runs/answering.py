@@ -13,10 +13,13 @@ from numpy.typing import ArrayLike
 from zoo.arguments import whole_number
 from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.errors import NotCapableError
+from zoo.evaluation.calibration.adapted import Adapted
+from zoo.evaluation.calibration.asked import Asked
+from zoo.evaluation.calibration.calibration import Calibrated, Calibration
+from zoo.evaluation.calibration.grid import Method, corrections, observed_difficulty
 from zoo.evaluation.questions import Setup
-from zoo.evaluation.tasks import Method, corrections
 from zoo.prediction.prediction import Prediction, Recalibration
-from zoo.runs.units import check_unseen, fingerprints, question
+from zoo.runs.units import check_unseen, fingerprints
 
 __all__ = ["Answers", "Query", "Task"]
 
@@ -46,7 +49,7 @@ class Query:
 class Answers(ABC):
     """Forecast, reconstruct, impute, represent, regress, generate, and calibrate."""
 
-    recalibrations: dict[str, Recalibration]
+    calibration: Calibration
     calibrated_on: list[str]
 
     @property
@@ -143,23 +146,54 @@ class Answers(ABC):
         method: Method = "conformal",
         tasks: Sequence[str] | None = None,
         setup: Setup | None = None,
+        by: str | None = None,
+        adapt: bool = True,
     ) -> Self:
         """Fit and keep a correction of every spread on movements that training never saw.
 
-        ``setup`` says how the tasks will be posed, such as which channels will be missing.
+        ``setup`` says how the tasks will be posed, such as which channels will be missing; without
+        it forecasts are calibrated after a grid of observed lengths, and what is asked between two
+        of them gets bands between theirs. Another question warns
+        (:class:`~zoo.errors.OtherQuestionWarning`). ``by`` is the group column whose values are
+        independent (``"subject"`` where new people are to be forecast), movements by default. With
+        ``adapt`` the bands of a forecast follow the errors that the model makes in the frames
+        observed, whose second half it is asked to forecast from the first. :attr:`calibration`
+        says what is promised.
         """
         check_record(data, "calibrate")
         check_unseen(data, self.fingerprints, "calibration")
-        self.recalibrations.update(corrections(self, data, method, tasks, setup))
+        found = corrections(self._bare(), data, method, tasks, setup, by, adapt)
+        self._keep(self.calibration.joined(found))
         self.calibrated_on.extend(fingerprints(data))
         return self
+
+    @abstractmethod
+    def _bare(self) -> Self:
+        """The same without calibration."""
+        ...
+
+    @abstractmethod
+    def _keep(self, calibration: Calibration) -> None:
+        """Take another calibration."""
+        ...
 
     def _answer(self, query: Query) -> Prediction:
         self._need(query.task)
         whole_number(query.draws, "draws")
         found = self.uncorrected(query)
-        asked = question(query.task, query.data)
-        return replace(found, recalibration=self.recalibrations.get(asked))
+        if not self.calibration or not found.has_spread:
+            return found
+        part = self.calibration.part(
+            Asked.of(query.task, query.data, query.horizon), getattr(query.data, "groups", {})
+        )
+        return found if part is None else replace(found, recalibration=self._fitting(part, query))
+
+    def _fitting(self, part: Calibrated, query: Query) -> Recalibration | None:
+        """The correction, for spreads that follow the errors observed where it is of such."""
+        if not part.adaptive:
+            return part.correction
+        factor = observed_difficulty(self._bare(), query.data, draws=query.draws, seed=query.seed)
+        return None if factor is None else Adapted(correction=part.correction, factor=factor)
 
     def _need(self, task: str) -> None:
         if task not in self.capabilities:

@@ -19,7 +19,8 @@ from zoo.contract.parts import Builds
 from zoo.contract.registry import Entry, named_well
 from zoo.datasets.records.scaling import Scaler
 from zoo.errors import DamagedRunError, NotRegisteredError, RunExistsError, UnknownNameError
-from zoo.evaluation.calibration.recalibration import recalibration_from_state
+from zoo.evaluation.calibration.asked import Asked
+from zoo.evaluation.calibration.calibration import Calibrated, Calibration
 from zoo.runs.assembly import assemble
 from zoo.runs.record import Record
 from zoo.types import Layout
@@ -51,9 +52,23 @@ class _Index:
     history: list[dict[str, Any]]
     trained_on: _TrainedOn
     made_of: dict[str, str]
-    recalibrations: dict[str, dict[str, Any]]
     calibrated_on: list[str]
     versions: dict[str, str]
+    calibration: list[dict[str, Any]] = field(default_factory=list)
+    recalibrations: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def bands(self, tensors: dict[str, Tensor]) -> Calibration:
+        """All corrections; those of runs saved without their questions are of unknown ones."""
+        new = Calibration.from_state(self.calibration, _part(tensors, "calibration."))
+        about = {"people": {}, "by": "", "adaptive": False}
+        old = [
+            Calibrated.from_state(
+                {**state, **about, "asked": Asked(task=task).state()},
+                _part(tensors, f"recalibration.{task}."),
+            )
+            for task, state in self.recalibrations.items()
+        ]
+        return new.joined(old)
 
 
 def save_run(run: Record, folder: Path, *, overwrite: bool = False) -> Path:
@@ -66,10 +81,8 @@ def save_run(run: Record, folder: Path, *, overwrite: bool = False) -> Path:
     tensors: dict[str, Tensor] = archive.state_of(model=assembly.model, guide=assembly.guide)
     if archive.exists(folder, "run") and not overwrite:
         _check_same(folder, run, tensors)
-    corrections: dict[str, Any] = {}
-    for task, recalibration in run.recalibrations.items():
-        corrections[task], extra = recalibration.state()
-        tensors.update({f"recalibration.{task}.{k}": v for k, v in extra.items()})
+    corrections, extra = run.calibration.state()
+    tensors.update({f"calibration.{k}": v for k, v in extra.items()})
     meta = {
         "entry": assembly.entry.name,
         "settings": json.loads(json.dumps(dict(assembly.settings), default=_plain)),
@@ -80,7 +93,7 @@ def save_run(run: Record, folder: Path, *, overwrite: bool = False) -> Path:
         "history": [_finite(row) for row in run.history],
         "trained_on": run.trained_on,
         "made_of": run.made_of,
-        "recalibrations": corrections,
+        "calibration": corrections,
         "calibrated_on": run.calibrated_on,
         "versions": {"movezoo": __version__, **{n: installed(n) for n in _LIBRARIES}},
     }
@@ -115,7 +128,7 @@ def _check_same(folder: Path, run: Record, tensors: dict[str, Tensor]) -> None:
     except DamagedRunError as error:
         raise RunExistsError(f"{error}; save(..., overwrite=True) replaces it") from None
     same = meta["entry"] == run.assembly.entry.name and set(tensors) == {
-        k for k in kept if not k.startswith("recalibration.")
+        k for k in kept if not k.startswith(("calibration.", "recalibration."))
     }
     if not (same and all(_equal(v, kept[k]) for k, v in tensors.items())):
         raise RunExistsError(
@@ -131,9 +144,11 @@ def _equal(one: Tensor, other: Tensor) -> bool:
 def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Record:
     entry, layout = _entry(index), index.layout
     assembly = assemble(entry, layout, index.settings, seed=index.seed, device=device)
-    parts = {"model": assembly.model, "guide": assembly.guide}
-    modules = {name: module for name, module in parts.items() if module is not None}
-    _check_names(tensors, [*modules, *(f"recalibration.{task}" for task in index.recalibrations)])
+    both = {"model": assembly.model, "guide": assembly.guide}
+    modules = {name: module for name, module in both.items() if module is not None}
+    parts = [f"calibration.{i}" for i in range(len(index.calibration))]
+    parts += [f"recalibration.{task}" for task in index.recalibrations]
+    _check_names(tensors, [*modules, *parts])
     for name, module in modules.items():
         if isinstance(module, Builds):
             module.build()
@@ -146,10 +161,7 @@ def _rebuild(index: _Index, tensors: dict[str, Tensor], device: str) -> Record:
         seconds=index.seconds,
         trained_on=asdict(index.trained_on),
         made_of=index.made_of,
-        recalibrations={
-            task: recalibration_from_state(state, _part(tensors, f"recalibration.{task}."))
-            for task, state in index.recalibrations.items()
-        },
+        calibration=index.bands(tensors),
         calibrated_on=index.calibrated_on,
     )
 

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from pydantic import TypeAdapter
-from torch import Tensor
 
 from zoo import archive
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError
-from zoo.evaluation.calibration.recalibration import recalibration_from_state
-from zoo.prediction.prediction import Prediction, Recalibration
+from zoo.evaluation.calibration.calibration import Calibration
+from zoo.prediction.prediction import Prediction
 from zoo.prediction.predictive import pooled
 from zoo.runs.answering import Answers, Query
 from zoo.runs.assembly import Assembly
@@ -24,17 +23,17 @@ from zoo.runs.rundir import Resume
 
 __all__ = ["Ensemble", "fit_ensemble"]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Index:
     members: int
-    recalibrations: dict[str, dict[str, Any]]
+    calibration: list[dict[str, Any]]
     calibrated_on: list[str]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Ensemble(Answers):
     r"""Runs of one layout whose predictions are averaged as distributions.
 
@@ -44,7 +43,7 @@ class Ensemble(Answers):
     using deep ensembles*, NIPS 2017. Members that are deterministic, such as ae-dmp, get a spread
     here: that of the members, and with few of them a coarse one, so that it wants calibration. The
     members may be of different entries. Latent coordinates of different members mean different
-    things: an ensemble does not represent. The members' own recalibrations are not used; the
+    things: an ensemble does not represent. The members' own calibrations are not used; the
     ensemble keeps its own.
 
     >>> import numpy as np, zoo
@@ -55,7 +54,7 @@ class Ensemble(Answers):
     """
 
     members: tuple[Run, ...]
-    recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+    calibration: Calibration = field(default_factory=Calibration)
     calibrated_on: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -96,20 +95,24 @@ class Ensemble(Answers):
         ]
         return replace(found[0], predictive=pooled([p.predictive for p in found]))
 
+    def _bare(self) -> Ensemble:
+        return replace(self, calibration=Calibration(), calibrated_on=[])
+
+    def _keep(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the members and the ensemble's calibration as folders of safetensors and JSON.
 
         Members of another training are replaced only with ``overwrite``, as :meth:`zoo.Run.save`.
         """
-        folder, tensors, states = Path(folder), dict[str, Tensor](), dict[str, Any]()
+        folder = Path(folder)
         for i, run in enumerate(self.members):
             run.save(folder / f"member-{i}", overwrite=overwrite)
-        for task, recalibration in self.recalibrations.items():
-            states[task], extra = recalibration.state()
-            tensors.update({f"{task}.{k}": v for k, v in extra.items()})
+        states, tensors = self.calibration.state()
         meta = {
             "members": len(self.members),
-            "recalibrations": states,
+            "calibration": states,
             "calibrated_on": self.calibrated_on,
         }
         archive.write(folder, "ensemble", meta, tensors, version=FORMAT_VERSION)
@@ -122,16 +125,13 @@ class Ensemble(Answers):
         meta, tensors = archive.read(folder, "ensemble", version=FORMAT_VERSION)
         try:
             index = TypeAdapter(_Index).validate_python(meta)
-            found = {
-                task: recalibration_from_state(state, _part(tensors, f"{task}."))
-                for task, state in index.recalibrations.items()
-            }
+            found = Calibration.from_state(index.calibration, tensors)
         except (LookupError, RuntimeError, TypeError, ValueError) as error:
             raise DamagedRunError(
                 f"{folder}/ensemble.json does not describe an ensemble: {error}"
             ) from error
         members = tuple(load(folder / f"member-{i}") for i in range(index.members))
-        return cls(members=members, recalibrations=found, calibrated_on=index.calibrated_on)
+        return cls(members=members, calibration=found, calibrated_on=index.calibrated_on)
 
 
 def fit_ensemble(
@@ -170,7 +170,3 @@ def fit_ensemble(
             for i, assembly in enumerate(assemblies)
         )
     )
-
-
-def _part(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

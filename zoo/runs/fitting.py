@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.evaluation.calibration.calibration import Calibration
 from zoo.inference.harness import Session
 from zoo.runs.assembly import Assembly
 from zoo.runs.disk import save_run
@@ -75,7 +76,7 @@ def _kept(assembly: Assembly, folder: Path, told: bool) -> Run:
     if told:
         done = f"{run.name}: trained before in {run.seconds:.0f} s, taken from {folder}"
         print(done, file=sys.stderr)
-    return replace(run, recalibrations={}, calibrated_on=[])
+    return replace(run, calibration=Calibration(), calibrated_on=[])
 
 
 def _fitted(

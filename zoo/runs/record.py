@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from zoo.datasets.records.scaling import Scaler
-from zoo.prediction.prediction import Recalibration
+from zoo.evaluation.calibration.calibration import Calibration
 from zoo.runs.assembly import Assembly
 
 __all__ = ["Record"]
@@ -16,7 +16,7 @@ __all__ = ["Record"]
 class Record:
     """All that is kept of a trained model.
 
-    ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
+    ``history`` has a row an epoch or iteration; ``calibration`` what bands were corrected for;
     ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed,
     as ``calibrated_on`` are of those that bands were calibrated on;
     ``made_of`` all that determined it (:mod:`zoo.runs.fingerprint`), empty where it was trained
@@ -29,5 +29,5 @@ class Record:
     seconds: float
     trained_on: dict[str, Any]
     made_of: dict[str, str] = field(default_factory=dict)
-    recalibrations: dict[str, Recalibration] = field(default_factory=dict)
+    calibration: Calibration = field(default_factory=Calibration)
     calibrated_on: list[str] = field(default_factory=list)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.evaluation.calibration.calibration import Calibration
 from zoo.evaluation.questions import Setup
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
@@ -36,7 +37,7 @@ class Run(Record, Answers):
 
     def __repr__(self) -> str:
         """Model, data, tasks and calibration in one line."""
-        calibrated = ", ".join(self.recalibrations) or "nothing"
+        calibrated = ", ".join(self.calibration.tasks) or "nothing"
         return (
             f"Run of {self.name} on {self.trained_on['name']!r}: "
             f"can {', '.join(self.capabilities)}; calibrated for {calibrated}"
@@ -103,6 +104,12 @@ class Run(Record, Answers):
         """
         with free(Path(folder)):
             return save_run(self, Path(folder), overwrite=overwrite)
+
+    def _bare(self) -> Run:
+        return replace(self, calibration=Calibration(), calibrated_on=[])
+
+    def _keep(self, calibration: Calibration) -> None:
+        self.calibration = calibration
 
     def _method(self, query: Query) -> Answer:
         """The model's method for the task, as it is asked about a batch."""

@@ -25,7 +25,7 @@ from zoo.runs.assembly import Assembly
 from zoo.streams import seeded
 from zoo.types import Batch, Posterior
 
-__all__ = ["Answer", "Exchange", "check_unseen", "fingerprints", "question"]
+__all__ = ["Answer", "Exchange", "check_unseen", "fingerprints"]
 
 FAR = 0.1
 Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
@@ -194,15 +194,6 @@ def _check_begin(assembly: Assembly, data: Sequences) -> None:
             WindowsWarning,
             stacklevel=7,
         )
-
-
-def question(task: str, data: Sequences) -> str:
-    """Name under which a task's recalibration is kept: imputation of joints or of a section."""
-    if task != "impute":
-        return task
-    inside = torch.arange(data.values.shape[1]) < data.lengths[:, None]
-    section = bool((inside & ~data.mask.any(-1)).any())
-    return "impute section" if section else "impute joints"
 
 
 def _finite(values: Tensor) -> bool:

@@ -62,6 +62,16 @@ class Curve:
         """Where the curve reaches ``y``."""
         return interpolate(y, self.y, self.x)
 
+    def blend(self, other: Curve, share: float) -> Curve:
+        """The curve at a share of the way to another, at every ``x``.
+
+        >>> x = torch.tensor([0.0, 1.0])
+        >>> Curve.through(x, x).blend(Curve.through(x, 3 * x), 0.5)(torch.tensor([2.0]))
+        tensor([4.])
+        """
+        x = torch.cat([self.x, other.x]).unique()
+        return Curve(x=x, y=torch.lerp(self(x), other(x), share))
+
     def state(self) -> dict[str, Tensor]:
         """Its tensors."""
         return {"curve_x": self.x, "curve_y": self.y}

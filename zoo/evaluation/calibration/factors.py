@@ -78,6 +78,14 @@ class Factors:
             factor = factor * self.time[lead, None]
         return factor.to(raw.predictive.location)
 
+    def blend(self, other: Factors, share: float) -> Factors:
+        """Geometric means with another's; the shorter one's last lead time goes on."""
+        frames = max(len(self.time), len(other.time))
+        times = [f.time[torch.arange(frames).clamp(max=len(f.time) - 1)] for f in (self, other)]
+        pairs = {"level": (self.level, other.level), "channel": (self.channel, other.channel)}
+        found = {k: a ** (1 - share) * b**share for k, (a, b) in pairs.items()}
+        return Factors(**found, time=times[0] ** (1 - share) * times[1] ** share)
+
     def state(self) -> dict[str, Tensor]:
         """Its tensors."""
         return {"level": self.level, "channel": self.channel, "time": self.time}

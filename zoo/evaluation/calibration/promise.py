@@ -39,11 +39,13 @@ def rank(level: float, groups: int) -> int:
     return math.ceil((groups + 1) * level - 1e-9)
 
 
-def warn_of_few(answer: Answer, found: Recalibration, worth: float, reach: float) -> None:
+def warn_of_few(
+    answer: Answer, found: Recalibration, worth: float, reach: float, what: str, stacklevel: int = 3
+) -> None:
     """Warn where the groups cannot promise 90 %, and say what the band rests on instead.
 
-    ``worth`` are the independent entries that the groups are counted as, ``reach`` the widest
-    level that these support.
+    ``what`` was calibrated for; ``worth`` are the independent entries that the groups are counted
+    as, ``reach`` the widest level that these support.
     """
     groups = answer.groups
     if promised(LEVEL, groups) >= LEVEL:
@@ -51,14 +53,14 @@ def warn_of_few(answer: Answer, found: Recalibration, worth: float, reach: float
     raw, mask = answer.prediction, answer.mask
     wider = _width(raw.recalibrated(found), mask) / _width(raw, mask)
     warnings.warn(
-        f"{raw.task}: conformal bands fitted on {groups} groups; the most that so few can promise "
+        f"{what}: conformal bands fitted on {groups} groups; the most that so few can promise "
         f"for a new group is {promised(LEVEL, groups):.0%}, since a {LEVEL:.0%} band with a "
         f"guarantee takes the score of rank {rank(LEVEL, groups)} and there are {groups}. The band "
         f"given counts the groups' entries as {worth:.1f} independent ones (enough for "
         f"{reach:.0%}, continued like a Gaussian's beyond) and is on average {wider:.2f} times as "
         "wide as the raw one; nothing is promised for it",
         FewGroupsWarning,
-        stacklevel=3,
+        stacklevel=stacklevel,
     )
 
 

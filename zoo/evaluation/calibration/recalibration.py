@@ -8,7 +8,7 @@ group weighs the same, and scores that set a level come from groups left out of 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any, ClassVar, Protocol, Self
 
@@ -36,6 +36,8 @@ __all__ = [
     "Conformal",
     "Isotonic",
     "Scale",
+    "Stored",
+    "fitted",
     "recalibrate",
     "recalibration_from_state",
 ]
@@ -61,7 +63,7 @@ class Scale:
 
     def predictive(self, raw: Prediction) -> Predictive:
         """The stretched mixture."""
-        return _stretched(raw.predictive, self.factors.of(raw))
+        return raw.predictive.stretched(self.factors.of(raw))
 
     def quantile(self, raw: Prediction, level: float) -> Tensor:
         """Quantile of the stretched mixture."""
@@ -74,6 +76,15 @@ class Scale:
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Draws stretched about the mean."""
         return raw.mean + self.factors.of(raw) * (draws - raw.mean)
+
+    def rows(self, index: slice | Tensor) -> Self:
+        """The correction of some movements, which is that of all."""
+        return self
+
+    def blend(self, other: Scale, share: float) -> Scale:
+        """Between this correction and another, at a share of the way."""
+        factors = self.factors.blend(other.factors, share)
+        return Scale(factors=factors, groups=min(self.groups, other.groups))
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
@@ -149,6 +160,20 @@ class Conformal:
         threshold = (self.thresholds(score.abs()) * score.sign()).to(draws)
         return raw.mean + threshold * self._spread(raw)
 
+    def rows(self, index: slice | Tensor) -> Self:
+        """The correction of some movements, which is that of all."""
+        return self
+
+    def blend(self, other: Conformal, share: float) -> Conformal:
+        """Between this correction and another, at a share of the way."""
+        return Conformal(
+            factors=self.factors.blend(other.factors, share),
+            thresholds=self.thresholds.blend(other.thresholds, share),
+            groups=min(self.groups, other.groups),
+            worth=min(self.worth, other.worth),
+            reach=min(self.reach, other.reach),
+        )
+
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
         meta = {"groups": self.groups, "worth": self.worth, "reach": self.reach}
@@ -217,6 +242,18 @@ class Isotonic:
         knots = torch.stack([raw.quantile_at(s / 2) for s in range(-8, 9)])
         return self.scale.transport(raw, look_up(knots, 2 * score + 8))
 
+    def rows(self, index: slice | Tensor) -> Self:
+        """The correction of some movements, which is that of all."""
+        return self
+
+    def blend(self, other: Isotonic, share: float) -> Isotonic:
+        """Between this correction and another, at a share of the way."""
+        return Isotonic(
+            scale=self.scale.blend(other.scale, share),
+            levels=self.levels.blend(other.levels, share),
+            groups=min(self.groups, other.groups),
+        )
+
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
         meta, tensors = self.scale.state()
@@ -232,10 +269,29 @@ class Isotonic:
         )
 
 
-class _Kind(Protocol):
-    def fit(self, answer: Answer, by: tuple[By, ...]) -> Recalibration: ...
+class Stored(Recalibration, Protocol):
+    """A correction that a run keeps: it can be stored, and blended with another of its kind."""
 
-    def from_state(self, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Recalibration: ...
+    kind: ClassVar[str]
+
+    @property
+    def groups(self) -> int:
+        """Number of groups that it was fitted on."""
+        ...
+
+    def blend(self, other: Any, share: float) -> Stored:
+        """Between this correction and another, at a share of the way."""
+        ...
+
+    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """What a file must keep of it: JSON with its ``kind``, and tensors."""
+        ...
+
+
+class _Kind(Protocol):
+    def fit(self, answer: Answer, by: tuple[By, ...]) -> Stored: ...
+
+    def from_state(self, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Stored: ...
 
 
 RECALIBRATIONS: dict[str, _Kind] = {k.kind: k for k in (Conformal, Isotonic, Scale)}
@@ -249,7 +305,7 @@ def recalibrate(
     groups: Groups | None = None,
     *,
     by: tuple[By, ...] = ("channel", "time"),
-) -> Recalibration:
+) -> Stored:
     """A correction of ``prediction``'s spread, to be used on predictions of the same kind.
 
     ``kind`` is ``conformal``, ``isotonic`` or ``scale``; ``by`` says which factors are fitted
@@ -268,15 +324,20 @@ def recalibrate(
     True
     """
     answer = Answer.of(prediction.raw, truth, mask, groups)
-    if answer.groups < 2:
-        raise ValueError("recalibration needs at least 2 groups (movements or items); got 1")
-    found = _kind(kind).fit(answer, by)
+    found = fitted(kind, answer, by)
     if isinstance(found, Conformal):
-        warn_of_few(answer, found, found.worth, found.reach)
+        warn_of_few(answer, found, found.worth, found.reach, prediction.task)
     return found
 
 
-def recalibration_from_state(meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Recalibration:
+def fitted(kind: str, answer: Answer, by: tuple[By, ...] = ("channel", "time")) -> Stored:
+    """The same correction without a word on how few groups there are."""
+    if answer.groups < 2:
+        raise ValueError("recalibration needs at least 2 groups (movements or items); got 1")
+    return _kind(kind).fit(answer, by)
+
+
+def recalibration_from_state(meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Stored:
     """The recalibration that ``state()`` gave JSON and tensors of."""
     return _kind(meta["kind"]).from_state(meta, tensors)
 
@@ -285,14 +346,3 @@ def _kind(name: str) -> _Kind:
     if name not in RECALIBRATIONS:
         raise UnknownNameError(f"no recalibration {name!r}; there are {', '.join(RECALIBRATIONS)}")
     return RECALIBRATIONS[name]
-
-
-def _stretched(p: Predictive, factor: Tensor) -> Predictive:
-    mean = p.location.mean(0)
-    return replace(
-        p,
-        location=mean + factor * (p.location - mean),
-        noise=None if p.noise is None else p.noise * factor,
-        epistemic=None if p.epistemic is None else p.epistemic * factor,
-        draws=None if p.draws is None else mean + factor * (p.draws - mean),
-    )
