@@ -58,7 +58,6 @@ from zoo.evaluation.figures.postures import posture_map, posture_strips
 from zoo.faces.screening import screen_run
 from zoo.movement.template import match
 from zoo.nn.metric import sensitivity
-from zoo.prediction.predictive import Predictive
 from zoo.studies import stored
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
@@ -188,12 +187,10 @@ def grid(points: int) -> torch.Tensor:
     return torch.stack(torch.meshgrid(*sides, indexing="xy"), -1)
 
 
-decoder, radians = plane.model.decoder, plane.scaler.channel_scale.float()
-norm = sensitivity(lambda z: decoder(z) * radians, grid(120))
+radians = plane.scaler.channel_scale.float()
+norm = sensitivity(lambda z: plane.model.decode(z).location * radians, grid(120))
 coarse = grid(5)
-with torch.no_grad():
-    angles = decoder(coarse)
-postures = plane.exchange.unscaled(Predictive(location=angles[None]), "reconstruct").location[0]
+postures = plane.decode(coarse).mean
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
 extent = [float(v) for pair in zip(corner, opposite, strict=True) for v in pair]

@@ -200,5 +200,5 @@ def test_data_of_the_wrong_kind_are_refused():
         model.condition("data")
     with pytest.raises(ValueError, match="noise must be positive; got 0"):
         gp.Config(noise=0.0)
-    with pytest.raises(ValueError, match="noise_floor must be below noise; got 0.2 and 0.1"):
+    with pytest.raises(ValueError, match=r"noise_floor must be below noise; got 0.2 and 0.1"):
         gp.Config(noise_floor=0.2)

@@ -22,6 +22,8 @@ from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Posterior, Wishes
 
 __all__ = [
+    "Decodes",
+    "Encodes",
     "FollowsPhase",
     "Forecasts",
     "Generates",
@@ -49,6 +51,26 @@ class Represents(Protocol):
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(z_t | x), shape (sequence, time, latent)."""
+        ...
+
+
+@runtime_checkable
+class Encodes(Protocol):
+    """Latent coordinates of frames, of a model whose ``represent`` says more than they do."""
+
+    def encode(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """p(z_t | x_t), shape (sequence, time, latent)."""
+        ...
+
+
+@runtime_checkable
+class Decodes(Protocol):
+    """Frames of latent coordinates, such as :meth:`Represents.represent` gives them."""
+
+    latent_dim: int
+
+    def decode(self, z: Float[Tensor, "sample sequence time latent"], /) -> Predictive:
+        """p(x_t | z_t), shape (sequence, time, channel)."""
         ...
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 from pydantic import TypeAdapter
 from torch import Tensor
 
 from zoo import archive
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import DamagedRunError
+from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.calibration.recalibration import recalibration_from_state
 from zoo.prediction.prediction import Prediction, Recalibration
 from zoo.prediction.predictive import pooled
@@ -25,6 +25,7 @@ from zoo.runs.rundir import Resume
 __all__ = ["Ensemble", "fit_ensemble"]
 
 FORMAT_VERSION = 1
+_OWN = "every member has latent coordinates of its own; ask one of its members"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +96,14 @@ class Ensemble(Answers):
             for i, run in enumerate(self.members)
         ]
         return replace(found[0], predictive=pooled([p.predictive for p in found]))
+
+    def encode(self, data: Sequences) -> NoReturn:
+        """Refused: members have latent coordinates of their own; ask one of :attr:`members`."""
+        raise NotCapableError(f"{self.name} cannot encode: {_OWN}")
+
+    def decode(self, latent: object) -> NoReturn:
+        """Refused as :meth:`encode` is."""
+        raise NotCapableError(f"{self.name} cannot decode: {_OWN}")
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the members and the ensemble's calibration as folders of safetensors and JSON.

@@ -127,6 +127,11 @@ class PCA(nn.Module):
             draws=z @ f.loading.T + f.mean,
         )
 
+    def decode(self, z: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z_t)."""
+        f = self.factors()
+        return Predictive(location=z @ f.loading.T + f.mean, noise=f.noise, joint=True)
+
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(x_missing | x_seen), the exact Gaussian conditional; seen entries reconstructed."""
         return self.reconstruct(batch, posterior, draws=draws)
