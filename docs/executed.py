@@ -44,7 +44,9 @@ def executed(script: Path) -> Any:
             return found
     notebook = jupytext.read(script)
     print(f"{script.name}: executing, which takes minutes")
-    NotebookClient(notebook, timeout=TIMEOUT, resources={"metadata": {"path": ROOT}}).execute()
+    client = NotebookClient(notebook, timeout=TIMEOUT, resources={"metadata": {"path": ROOT}})
+    client.create_kernel_manager().transport = "ipc"
+    client.execute()
     today = datetime.date.today().isoformat()
     notebook.metadata["movezoo"] = {"key": key, "date": today, "commit": commit()}
     KEPT.mkdir(parents=True, exist_ok=True)
