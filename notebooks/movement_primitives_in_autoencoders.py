@@ -313,7 +313,7 @@ plt.show()
 
 # %% [markdown]
 # A pass costs nothing and one or two are enough; what is left is what the small network does not
-# know of movements it never saw. The stored experiment therefore keeps *trained on* (what the
+# know of held-out movements. The stored experiment therefore keeps *trained on* (what the
 # thesis reports) and *held out* apart, and asks other models the same, by conditioning. Its last
 # column is the share of hidden angles inside the 90 % band, as the models give it: not calibrated.
 

@@ -304,7 +304,7 @@ stored("E6.4")
 # a recording begins. A forecast weighs every phase and many tempos by what was seen.
 #
 # Here: twelve walks of subject 35 to learn from, four to judge (simulated: an arm that stirs,
-# twenty times to learn from). Less than a second is seen, and two are foretold.
+# twenty times to learn from). Less than a second is observed, and two are forecast.
 
 # %%
 if real:
@@ -350,7 +350,7 @@ low, high = forecast.interval(0.9)
 figure, panels = plt.subplots(1, 3, figsize=(12, 3), sharey=True, layout="constrained")
 for k, axes in enumerate(panels):
     axes.plot(seconds, unseen.values[k, :, column], "k:", label="what came")
-    axes.plot(seconds[:short], unseen.values[k, :short, column], "k", label="seen")
+    axes.plot(seconds[:short], unseen.values[k, :short, column], "k", label="observed")
     axes.plot(seconds[short:], forecast.mean[k, :, column], color="C1", label="forecast")
     band = (low[k, :, column], high[k, :, column])
     axes.fill_between(seconds[short:], *band, color="C1", alpha=0.25, lw=0, label="90 % band")

@@ -318,7 +318,7 @@ def test_what_cannot_be_calibrated_is_refused_with_its_reason() -> None:
     with pytest.raises(ValueError, match="5 channels; this recalibration was fitted on 6"):
         other.recalibrated(found).quantile(0.9)
     still = items(torch.zeros(5, 1), noise=torch.zeros(1).double())
-    with pytest.raises(ValueError, match="spread of 0"):
+    with pytest.raises(ValueError, match="standard deviation of 0"):
         recalibrate("scale", still, torch.ones(5, 1))
 
 

@@ -46,7 +46,7 @@ class Predictor(Protocol):
         ...
 
     def forecast(self, data: Sequences, *, horizon: int, draws: int, seed: int) -> Prediction:
-        """The frames after those seen."""
+        """The frames after those observed."""
         ...
 
     def impute(self, data: Sequences, *, draws: int, seed: int) -> Prediction:
@@ -152,7 +152,7 @@ def corrections(
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
 ) -> dict[str, Recalibration]:
-    """A correction of the spread for every task, fitted on ``data``.
+    """A correction of the bands for every task, fitted on ``data``.
 
     A task without an answer on these data stays as it is, with a NotCalibratedWarning.
     """

@@ -128,7 +128,7 @@ def fit(
     figure: Figure = None,
     json: Json = False,
 ) -> None:
-    """Train a model on four-way split data and calibrate its spreads on movements unseen.
+    """Train a model on four-way split data and calibrate its bands on held-out movements.
 
     Example: `zoo fit vae-dmp --data cmu-mocap/35-walk --set latent_dim=5 --run-dir runs/walk`
 
@@ -209,7 +209,7 @@ def play_command(
     start: Annotated[int, typer.Option(help="With --onto: frame where it begins.")] = 20,
     steps: Annotated[int, typer.Option(help="With --onto: frames it takes.")] = 18,
 ) -> None:
-    """Play a movement in a page: data, reconstruction, forecast with its spread, and a switch."""
+    """Play a movement in a page: data, reconstruction, forecast with its bands, and a switch."""
     from zoo.faces.screening import screen
 
     player = screen(

@@ -132,7 +132,7 @@ def _enough(calib: Pairs | Sequences) -> bool:
     if count < 2:
         warnings.warn(
             f"the calibration part holds {count} movement or item and at least 2 are needed: "
-            "spreads stay as the model gives them (more data, or other --parts)",
+            "bands stay as the model gives them (more data, or other --parts)",
             stacklevel=3,
         )
     return count >= 2
@@ -154,7 +154,7 @@ def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:
 
 
 def _unseen(run: Run, folder: Path) -> Any:
-    """What a run without a plan has not seen of the data that it names."""
+    """What is held out, for a run without a plan, of the data that it names."""
     name, known = run.trained_on["name"], run.trained_on["fingerprints"]
     advice = f"{folder} holds no {_PLAN}: name a data set with --data"
     try:

@@ -64,7 +64,7 @@ class Answers(ABC):
     @property
     @abstractmethod
     def fingerprints(self) -> list[str]:
-        """Those of the movements or items that training saw."""
+        """Those of the movements or items that were trained on."""
         ...
 
     @abstractmethod
@@ -144,7 +144,7 @@ class Answers(ABC):
         tasks: Sequence[str] | None = None,
         setup: Setup | None = None,
     ) -> Self:
-        """Fit and keep a correction of every spread on movements that training never saw.
+        """Fit and keep a correction of the bands on held-out movements.
 
         ``setup`` says how the tasks will be posed, such as which channels will be missing.
         """

@@ -42,7 +42,7 @@ class Ensemble(Answers):
     p(y | x) = 1/M Σ_m p_m(y | x)
 
     Lakshminarayanan, Pritzel & Blundell, *Simple and scalable predictive uncertainty estimation
-    using deep ensembles*, NIPS 2017. Members that are deterministic, such as ae-dmp, get a spread
+    using deep ensembles*, NIPS 2017. Members that are deterministic, such as ae-dmp, get bands
     here: that of the members, and with few of them a coarse one, so that it wants calibration. The
     members may be of different entries. Latent coordinates of different members mean different
     things: an ensemble does not represent. The members' own recalibrations are not used; the
@@ -86,7 +86,7 @@ class Ensemble(Answers):
 
     @property
     def fingerprints(self) -> list[str]:
-        """Those of the movements or items that a member saw in training."""
+        """Those of the movements or items that a member was trained on."""
         return sorted({f for run in self.members for f in run.fingerprints})
 
     def uncorrected(self, query: Query) -> Prediction:

@@ -16,7 +16,7 @@ __all__ = ["Record"]
 class Record:
     """All that is kept of a trained model.
 
-    ``history`` has a row an epoch or iteration; ``recalibrations`` one correction a task;
+    ``history`` has a row per epoch or iteration; ``recalibrations`` one correction per task;
     ``trained_on`` fingerprints of the training data, so that an evaluation on them is noticed,
     as ``calibrated_on`` are of those that bands were calibrated on;
     ``made_of`` all that determined it (:mod:`zoo.runs.fingerprint`), empty where it was trained

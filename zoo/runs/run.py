@@ -69,7 +69,7 @@ class Run(Record, Answers):
 
     @property
     def fingerprints(self) -> list[str]:
-        """Those of the movements or items that training saw."""
+        """Those of the movements or items that were trained on."""
         found: list[str] = self.trained_on["fingerprints"]
         return found
 
@@ -233,7 +233,7 @@ def evaluate(
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
 ) -> Table:
-    """Score every task that the model can do, or those named, on data it never saw.
+    """Score every task that the model can do, or those named, on held-out data.
 
     A task without an answer on these data is a line that says why; the others are scored.
     """

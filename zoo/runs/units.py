@@ -189,8 +189,8 @@ def _check_begin(assembly: Assembly, data: Sequences) -> None:
     if not layout.windows and begins - {0}:
         warnings.warn(
             f"{name} was trained on whole movements and takes the first frame of each window for "
-            f"the begin of one; these begin at frame {min(begins - {0})} and later: train it on "
-            "windows too, or give movements from their first frame on",
+            f"the beginning of one; these begin at frame {min(begins - {0})} and later: train it "
+            "on windows too, or give movements from their first frame on",
             WindowsWarning,
             stacklevel=7,
         )
@@ -230,7 +230,7 @@ def check_unseen(
     if again:
         warnings.warn(
             f"{again} of {len(data)} movements or items given for {purpose} were {used} "
-            "(these or equal ones); spreads on them look better than they are",
+            "(these or equal ones); bands on them look better than they are",
             stacklevel=3,
         )
 

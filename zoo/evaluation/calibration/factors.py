@@ -1,4 +1,4 @@
-"""Factors by which a spread is off, per channel and lead time, shrunk to what the groups tell."""
+"""Factors that correct a standard deviation, per channel and lead time, shrunk by the groups."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def standardised(answer: Answer) -> Float[Tensor, "sequence *rest"]:
     std = raw.std.double()
     if bool((std[answer.mask] <= 0).any()):
         count = int((std[answer.mask] <= 0).sum())
-        raise ValueError(f"{count} known entries are predicted with a spread of 0")
+        raise ValueError(f"{count} known entries are predicted with a standard deviation of 0")
     z = (answer.truth.double() - raw.mean.double()) / std
     return torch.where(answer.mask, z, 0.0)
 

@@ -1,4 +1,4 @@
-"""Recalibration of predictive spreads on groups that the model never saw.
+"""Recalibration of predictive standard deviations on held-out groups.
 
 What is exchangeable between calibration and use is a whole group (a movement), never a frame. Few
 groups have to do, so the factors of channels and lead times are shrunk (:class:`Factors`), every
@@ -132,7 +132,7 @@ class Conformal:
         """No mixture: only the quantiles are known."""
 
     def quantile(self, raw: Prediction, level: float) -> Tensor:
-        """Mean plus the threshold of that level times the corrected spread."""
+        """Mean plus the threshold of that level times the corrected standard deviation."""
         score = torch.tensor(NormalDist().inv_cdf(level), dtype=torch.float64)
         threshold = self.thresholds(score.abs()) * score.sign()
         return raw.mean + threshold.to(raw.mean) * self._spread(raw)
@@ -201,7 +201,7 @@ class Isotonic:
         """No mixture: only the quantiles are known."""
 
     def quantile(self, raw: Prediction, level: float) -> Tensor:
-        """Quantile of the stretched mixture at the level that comes true that often."""
+        """Quantile of the stretched mixture at the level whose observed frequency it is."""
         score = torch.tensor(NormalDist().inv_cdf(level), dtype=torch.float64)
         return self.scale.transport(raw, raw.quantile_at(float(self.levels(score))))
 
@@ -250,7 +250,7 @@ def recalibrate(
     *,
     by: tuple[By, ...] = ("channel", "time"),
 ) -> Recalibration:
-    """A correction of ``prediction``'s spread, to be used on predictions of the same kind.
+    """A correction of ``prediction``'s bands, to be used on predictions of the same kind.
 
     ``kind`` is ``conformal``, ``isotonic`` or ``scale``; ``by`` says which factors are fitted
     beside the common one. Groups are those of :func:`~zoo.evaluation.answers.clusters`. Of too few

@@ -25,7 +25,8 @@ class Config:
     """Settings of :class:`PCA`.
 
     ``noise_floor`` is the least σ in scaled units, for data of lower rank than they have channels;
-    ``em_iterations`` and ``em_tolerance`` (nats a seen entry) end EM where entries are missing.
+    ``em_iterations`` and ``em_tolerance`` (nats per observed entry) end EM where entries
+    are missing.
     """
 
     latent_dim: Count = 5
