@@ -17,13 +17,13 @@ from zoo.prediction.prediction import Prediction, Recalibration
 
 __all__ = [
     "Method",
+    "Outcome",
     "Predictor",
     "Trained",
-    "Trial",
     "answered",
     "corrections",
+    "outcomes",
     "posed",
-    "trials",
 ]
 
 Method = Literal["conformal", "isotonic", "scale"]
@@ -74,7 +74,7 @@ class Trained(Predictor, Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class Outcome:
     """One answer and its truth; ``mask`` is True where the truth is known and was asked for."""
 
     task: str
@@ -96,12 +96,12 @@ def answered(run: Predictor, question: Question, *, draws: int, seed: int) -> Pr
     return run.impute(given, draws=draws, seed=seed)
 
 
-def trials(
+def outcomes(
     run: Predictor,
     data: Pairs | Sequences,
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
-) -> list[Trial]:
+) -> list[Outcome]:
     """Pose every task that the run's model can do, or those named, on ``data``.
 
     A task without an answer on these data is left out, see :func:`posed`.
@@ -114,17 +114,17 @@ def posed(
     data: Pairs | Sequences,
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
-) -> tuple[list[Trial], dict[str, str]]:
+) -> tuple[list[Outcome], dict[str, str]]:
     """The answers to every task that the model can do, or to those named, and why others have none.
 
     Where no task has an answer the first one's UnanswerableError is raised.
     """
-    found: list[Trial] = []
+    found: list[Outcome] = []
     refused: dict[str, UnanswerableError] = {}
     how = setup or Setup()
     for name in _names(run, tasks):
         try:
-            found.append(_trial(run, ask(name, data, how), how))
+            found.append(_outcome(run, ask(name, data, how), how))
         except UnanswerableError as error:
             refused[name] = error
     if refused and not found:
@@ -161,14 +161,16 @@ def corrections(
         told = f"{task} has no answer on the calibration data and stays uncalibrated: {reason}"
         warnings.warn(told, NotCalibratedWarning, stacklevel=3)
     return {
-        trial.task: recalibrate(method, trial.prediction.raw, trial.truth, trial.mask, trial.groups)
-        for trial in found
-        if trial.prediction.has_spread
+        outcome.task: recalibrate(
+            method, outcome.prediction.raw, outcome.truth, outcome.mask, outcome.groups
+        )
+        for outcome in found
+        if outcome.prediction.has_spread
     }
 
 
-def _trial(run: Predictor, question: Question, setup: Setup) -> Trial:
-    return Trial(
+def _outcome(run: Predictor, question: Question, setup: Setup) -> Outcome:
+    return Outcome(
         task=question.task,
         prediction=answered(run, question, draws=setup.draws, seed=setup.seed),
         truth=question.truth,

@@ -134,15 +134,15 @@ def fit(
 
     Of one's own: `zoo fit promp --data walk.csv --run-dir runs/own --figure bands.png`
     """
-    from zoo.faces.commands import Plan, forecast_report, train
+    from zoo.faces.commands import Recipe, forecast_report, train
     from zoo.faces.tables import print_json, report_table
     from zoo.runs.run import evaluate as score
 
-    plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device, rate)
+    recipe = Recipe.parse(model, data, settings or [], by, parts, seed, calibrate, device, rate)
     advice = "repeat the command with --resume to go on from the last checkpoint, if there is one"
     with interruptible(advice):
-        run = train(plan, run_dir, resume=resume, overwrite=overwrite, progress=not json)
-    test = plan.load()[3]
+        run = train(recipe, run_dir, resume=resume, overwrite=overwrite, progress=not json)
+    test = recipe.load()[3]
     if output is not None or figure is not None:
         forecast_report(run, test, seen=None, horizon=None, output=output, figure=figure)
     if json:

@@ -28,7 +28,7 @@ from zoo.runs.answering import Answers, Query, Task
 from zoo.runs.assembly import create
 from zoo.runs.disk import load_run, save_run
 from zoo.runs.record import Record
-from zoo.runs.units import Answer, Exchange, check_unseen
+from zoo.runs.units import Ask, Exchange, check_unseen
 from zoo.streams import seeded
 from zoo.types import Wishes
 
@@ -169,7 +169,7 @@ class Run(Record, Answers):
         with free(Path(folder)):
             return save_run(self, Path(folder), overwrite=overwrite)
 
-    def _method(self, query: Query) -> Answer:
+    def _method(self, query: Query) -> Ask:
         """The model's method for the task, as it is asked about a batch."""
         method: Callable[..., Predictive] = getattr(self.model, query.task)
         draws = query.draws

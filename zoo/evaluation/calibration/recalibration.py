@@ -1,7 +1,7 @@
 """Recalibration of predictive standard deviations on held-out groups.
 
 What is exchangeable between calibration and use is a whole group (a movement), never a frame. Few
-groups have to do, so the factors of channels and lead times are shrunk (:class:`Factors`), every
+groups have to do, so the factors of channels and lead times are shrunk (:class:`Stretch`), every
 group weighs the same, and scores that set a level come from groups left out of the factors.
 """
 
@@ -18,7 +18,6 @@ from torch import Tensor
 from zoo.errors import UnknownNameError
 from zoo.evaluation.answers import Answer, Groups
 from zoo.evaluation.calibration.curve import Curve
-from zoo.evaluation.calibration.factors import By, Factors, crossed, standardised
 from zoo.evaluation.calibration.pool import (
     LEVELS,
     Pool,
@@ -28,6 +27,7 @@ from zoo.evaluation.calibration.pool import (
     scores_of_draws,
 )
 from zoo.evaluation.calibration.promise import warn_of_few
+from zoo.evaluation.calibration.stretch import By, Stretch, crossed, standardised
 from zoo.prediction.prediction import Prediction, Recalibration
 from zoo.prediction.predictive import Predictive
 
@@ -50,39 +50,39 @@ class Scale:
     """
 
     kind: ClassVar[str] = "scale"
-    factors: Factors
+    stretch: Stretch
     groups: int
 
     @classmethod
     def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
         """Variance factors from the mean squared standardised residual."""
         sizes = standardised(answer).square()
-        return cls(factors=Factors.fit(sizes, answer, by, 2), groups=answer.groups)
+        return cls(stretch=Stretch.fit(sizes, answer, by, 2), groups=answer.groups)
 
     def predictive(self, raw: Prediction) -> Predictive:
         """The stretched mixture."""
-        return _stretched(raw.predictive, self.factors.of(raw))
+        return _stretched(raw.predictive, self.stretch.of(raw))
 
     def quantile(self, raw: Prediction, level: float) -> Tensor:
         """Quantile of the stretched mixture."""
-        return raw.mean + self.factors.of(raw) * (raw.quantile(level) - raw.mean)
+        return raw.mean + self.stretch.of(raw) * (raw.quantile(level) - raw.mean)
 
     def cdf(self, raw: Prediction, value: Tensor) -> Tensor:
         """Distribution function of the stretched mixture."""
-        return raw.cdf(raw.mean + (value - raw.mean) / self.factors.of(raw))
+        return raw.cdf(raw.mean + (value - raw.mean) / self.stretch.of(raw))
 
     def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
         """Draws stretched about the mean."""
-        return raw.mean + self.factors.of(raw) * (draws - raw.mean)
+        return raw.mean + self.stretch.of(raw) * (draws - raw.mean)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
-        return {"kind": self.kind, "groups": self.groups}, self.factors.state()
+        return {"kind": self.kind, "groups": self.groups}, self.stretch.state()
 
     @classmethod
     def from_state(cls, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """What :meth:`state` gave."""
-        return cls(factors=Factors.from_state(tensors), groups=int(meta["groups"]))
+        return cls(stretch=Stretch.from_state(tensors), groups=int(meta["groups"]))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ class Conformal:
     """
 
     kind: ClassVar[str] = "conformal"
-    factors: Factors
+    stretch: Stretch
     thresholds: Curve
     groups: int
     worth: float
@@ -117,7 +117,7 @@ class Conformal:
         if not bool(supported.any()):
             raise ValueError(f"{answer.groups} groups are too few for any conformal interval")
         return cls(
-            factors=Factors.fit(sizes, answer, by, 1, common=False),
+            stretch=Stretch.fit(sizes, answer, by, 1, common=False),
             thresholds=Curve.through(
                 normal_score((1 + LEVELS[supported]) / 2),
                 pool.quantile(corrected[supported]),
@@ -152,13 +152,13 @@ class Conformal:
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON and tensors to store."""
         meta = {"groups": self.groups, "worth": self.worth, "reach": self.reach}
-        return {"kind": self.kind, **meta}, {**self.factors.state(), **self.thresholds.state()}
+        return {"kind": self.kind, **meta}, {**self.stretch.state(), **self.thresholds.state()}
 
     @classmethod
     def from_state(cls, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
         """What :meth:`state` gave."""
         return cls(
-            factors=Factors.from_state(tensors),
+            stretch=Stretch.from_state(tensors),
             thresholds=Curve.from_state(tensors),
             groups=int(meta["groups"]),
             worth=float(meta["worth"]),
@@ -166,7 +166,7 @@ class Conformal:
         )
 
     def _spread(self, raw: Prediction) -> Tensor:
-        spread = raw.std * self.factors.of(raw)
+        spread = raw.std * self.stretch.of(raw)
         return spread.clamp(min=torch.finfo(spread.dtype).tiny)
 
 
@@ -207,7 +207,7 @@ class Isotonic:
 
     def cdf(self, raw: Prediction, value: Tensor) -> Tensor:
         """Observed frequency of the stretched mixture's level."""
-        reduced = raw.mean + (value - raw.mean) / self.scale.factors.of(raw)
+        reduced = raw.mean + (value - raw.mean) / self.scale.stretch.of(raw)
         score = self.levels.inverse(raw.normal_score(reduced).double())
         return normal_level(score).to(value)
 

@@ -13,14 +13,14 @@ from zoo.evaluation.answers import Answer, group_sums
 from zoo.evaluation.calibration.curve import interpolate
 from zoo.prediction.prediction import Prediction
 
-__all__ = ["By", "Factors", "crossed", "standardised"]
+__all__ = ["By", "Stretch", "crossed", "standardised"]
 
 By = Literal["channel", "time"]
 _FOLDS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Factors:
+class Stretch:
     r"""σ̃_{t,c} = σ_{t,c} · a · b_c · d_t.
 
     b and d come from group means of the standardised residuals and are shrunk to 1 by empirical
@@ -114,7 +114,7 @@ def crossed(
             cluster=answer.cluster,
         )
         if bool(held.any()) and bool(rest.mask.any()):
-            out[held] = Factors.fit(sizes, rest, by, power, common).of(answer.prediction).to(out)
+            out[held] = Stretch.fit(sizes, rest, by, power, common).of(answer.prediction).to(out)
     return out
 
 
