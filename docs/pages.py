@@ -129,7 +129,10 @@ def write_results(home: Path) -> None:
     """A page for every result that has a table, with its figure, and an index."""
     rows, short = [], {}
     for page in sorted(RESULTS.glob("*.md"), key=lambda p: ("leaderboard" not in p.stem, p.stem)):
-        result, text = _stored(page.with_suffix(".json")), page.read_text("utf-8")
+        result, text = (
+            _stored(page.with_suffix(".json")),
+            page.read_text("utf-8").replace(" ± ", " ±\u00a0"),
+        )
         picture = page.with_suffix(".png")
         if picture.is_file():
             shutil.copy(picture, home)
