@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 
 from torch import Tensor
@@ -58,8 +59,16 @@ def warn_of_few(answer: Answer, found: Recalibration, worth: float, reach: float
         f"{reach:.0%}, continued like a Gaussian's beyond) and is on average {wider:.2f} times as "
         "wide as the raw one; nothing is promised for it",
         FewGroupsWarning,
-        stacklevel=3,
+        stacklevel=_caller(),
     )
+
+
+def _caller() -> int:
+    """The ``stacklevel`` of the line that called the package."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("zoo."):
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def _width(prediction: Prediction, mask: Tensor) -> float:
