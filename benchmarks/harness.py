@@ -84,7 +84,7 @@ def store(
     """Write ``results/NAME.json``: the payload with versions, processor, threads and duration.
 
     ``libraries`` are distributions to give the version of, beside the core ones; ``started`` is a
-    ``time.monotonic()`` of the begin of the measurement (default: the import of this module).
+    ``time.monotonic()`` of the start of the measurement (default: the import of this module).
     """
     begin = _STARTED if started is None else started
     document = {

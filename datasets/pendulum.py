@@ -1,4 +1,4 @@
-"""A simulated pendulum under a random policy, seen as states or as blurred images (§4.3.1)."""
+"""A simulated pendulum under a random policy, observed as states or as blurred images (§4.3.1)."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ Read = tuple[list[Part], float | None, Any]
 def _files(path: Path) -> list[Path]:
     """The file, or those of a folder; all must be of a kind that is read, and be what they say."""
     if not path.exists():
-        raise MissingDataError(f"there is no file {path}, seen from {Path.cwd()}")
+        raise MissingDataError(f"there is no file {path} in {Path.cwd()}")
     known = ", ".join(READERS)
     files = [path]
     if path.is_dir():

@@ -44,7 +44,9 @@ def executed(script: Path) -> Any:
             return found
     notebook = jupytext.read(script)
     print(f"{script.name}: executing, which takes minutes")
-    NotebookClient(notebook, timeout=TIMEOUT, resources={"metadata": {"path": ROOT}}).execute()
+    client = NotebookClient(notebook, timeout=TIMEOUT, resources={"metadata": {"path": ROOT}})
+    client.create_kernel_manager().transport = "ipc"
+    client.execute()
     today = datetime.date.today().isoformat()
     notebook.metadata["movezoo"] = {"key": key, "date": today, "commit": commit()}
     KEPT.mkdir(parents=True, exist_ok=True)
@@ -94,7 +96,9 @@ def _cell(cell: Any, home: Path, name: str) -> list[str]:
 def _output(output: Any, home: Path, name: str) -> str:
     """A picture, a page, a table or text; what only a notebook can show is left out."""
     if output.output_type == "stream":
-        return _text(output.text)
+        return _text(
+            re.sub(r"^/\S+/ipykernel_\d+/\d+\.py:", "line ", output.text, flags=re.MULTILINE)
+        )
     data = output.get("data", {})
     if "image/png" in data:
         (home / f"{name}.png").write_bytes(base64.b64decode(data["image/png"]))

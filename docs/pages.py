@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def write_models(home: Path) -> None:
     (home / "index.md").write_text(f"# Models\n\n{lead}\n\n{table(titles, rows)}\n", "utf-8")
     for entry in CATALOGUE:
         (home / f"{entry.name}.md").write_text(model_page(entry, home), "utf-8")
-    _navigation(home, "Models", [e.name for e in CATALOGUE])
+    _navigation(home, "Models", {e.name: e.name for e in CATALOGUE})
 
 
 def model_page(entry: Entry, home: Path) -> str:
@@ -75,7 +76,7 @@ def model_page(entry: Entry, home: Path) -> str:
         ("takes", entry.data),
         ("inference", _kind(entry)),
         ("guide", entry.posterior),
-        ("data set of the card", f"`{entry.dataset}`"),
+        ("default data set", f"`{entry.dataset}`"),
     )
     settings = [
         (f"`{key}`", s["part"], s["type"].replace(" | ", " or "), f"`{s['default']!r}`")
@@ -83,7 +84,7 @@ def model_page(entry: Entry, home: Path) -> str:
     ]
     parts = [
         f"# {entry.name}\n\n**{entry.summary}.**",
-        table(("", ""), facts),
+        table(("in short", entry.name), facts),
         f'```py\nmodel = zoo.create("{entry.name}", train)\n```',
         f"## The model\n\n{as_markdown(found.text)}",
         _figure(entry.name, home),
@@ -126,16 +127,20 @@ def _figure(name: str, home: Path) -> str:
 
 def write_results(home: Path) -> None:
     """A page for every result that has a table, with its figure, and an index."""
-    rows = []
+    rows, short = [], {}
     for page in sorted(RESULTS.glob("*.md"), key=lambda p: ("leaderboard" not in p.stem, p.stem)):
-        result, text = _stored(page.with_suffix(".json")), page.read_text("utf-8")
+        result, text = (
+            _stored(page.with_suffix(".json")),
+            page.read_text("utf-8").replace(" ± ", " ±\u00a0"),
+        )
         picture = page.with_suffix(".png")
         if picture.is_file():
             shutil.copy(picture, home)
             text += f"\n![{result['title']}]({picture.name})\n"
         (home / page.name).write_text(f"{text}\n{_origin(result)}\n", "utf-8")
         rows.append((f"[{page.stem}]({page.name})", result["title"], result["source"]))
-    _navigation(home, "Results", [str(row[0].split("]")[0][1:]) for row in rows])
+        short[page.stem] = _short(page.stem, result["title"])
+    _navigation(home, "Results", short)
     lead = (
         "Every figure comes from a command of this project, which wrote it to `results/` with "
         "seed, versions and duration. *Data* says whether it is the thesis' data, public data "
@@ -301,8 +306,16 @@ def _stored(file: Path) -> Any:
     return json.loads(file.read_text("utf-8"))
 
 
-def _navigation(home: Path, title: str, names: Sequence[str]) -> None:
-    lines = [f"- [{title}](index.md)", *(f"- [{name}]({name}.md)" for name in names)]
+def _short(name: str, title: str) -> str:
+    """A result in a few words, for the navigation."""
+    if name.startswith("leaderboard_"):
+        return f"Leaderboard {name.removeprefix('leaderboard_')}"
+    words = re.split("[:,]", title)[0]
+    return f"{name} {words}" if name.startswith("E") else words
+
+
+def _navigation(home: Path, title: str, names: Mapping[str, str]) -> None:
+    lines = [f"- [{title}](index.md)", *(f"- [{words}]({n}.md)" for n, words in names.items())]
     (home / "SUMMARY.md").write_text("\n".join(lines) + "\n", "utf-8")
 
 

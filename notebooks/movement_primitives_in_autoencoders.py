@@ -40,6 +40,7 @@
 # %%
 import os
 import warnings
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -50,7 +51,6 @@ import zoo
 from zoo.errors import PosteriorCollapseWarning
 from zoo.evaluation.figures.bands import forecast_bands, reliability
 from zoo.evaluation.figures.postures import posture_strip, posture_strips
-from zoo.prediction.predictive import Predictive
 from zoo.studies import stored
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
@@ -145,8 +145,7 @@ Markdown("\n".join(lines))
 # %%
 figure, panels = plt.subplots(2, 2, figsize=(11, 4.6), sharex=True, layout="constrained")
 for column, (label, run) in zip(panels.T, list(runs.items())[:2], strict=True):
-    with torch.no_grad():
-        encoded = run.assembly.guide.encode(run.exchange.scaled(movement).values.float()).mean[0]
+    encoded = run.encode(movement)[0][0]
     rolled = run.represent(movement, draws=1).mean[0]
     wide = encoded.var(0).argsort(descending=True)[:2].tolist()
     for axes, unit in zip(column, wide, strict=True):
@@ -238,20 +237,13 @@ switched = calm[:1].clone()
 switched[..., unit] += raised[unit]
 
 
-def decoded(run: zoo.Run, path: torch.Tensor) -> torch.Tensor:
-    """Latent paths as joint angles in rad."""
-    with torch.no_grad():
-        angles = run.model.decoder(path.float())
-    return run.exchange.unscaled(Predictive(location=angles[None]), "generate").location[0]
-
-
 rows = {
     kinds[0]: calm[:1],
     f"{kinds[0]}, unit {unit + 1} switched on": switched,
     kinds[1]: other[:1],
 }
 figure, panels = plt.subplots(3, 1, figsize=(11, 5 if real else 4), layout="constrained")
-made = {name: decoded(sparse, path)[0] for name, path in rows.items()}
+made = {name: sparse.decode(path).mean[0] for name, path in rows.items()}
 posture_strips(panels, made, mixed.channels)
 panels[-1].set_xlabel("frame")
 plt.show()
@@ -296,19 +288,13 @@ model = zoo.fit(zoo.create("ae-dmp", train, epochs=800, corrupted=1.0, **size), 
 
 holes = torch.ones_like(unseen.mask)
 holes[..., [unseen.channels.index(c) for c in hidden]] = False
-scaled = model.exchange.scaled(unseen).values.float()
-guess, chain = torch.where(holes, scaled, 0.0), []
-with torch.no_grad():
-    for _ in range(9):
-        chain.append(guess)
-        guess = torch.where(
-            holes, scaled, model.model.decoder(model.assembly.guide.encode(guess).mean)
-        )
+guess, chain = torch.where(holes, unseen.values, train.values.mean((0, 1))), []
+for _ in range(9):
+    chain.append(guess)
+    code, _ = model.encode(replace(unseen, values=guess))
+    guess = torch.where(holes, unseen.values, model.decode(code).mean)
 
-angles = [
-    model.exchange.unscaled(Predictive(location=x[None]), "impute").location[0] for x in chain
-]
-errors = [1e3 * float((x - unseen.values)[~holes].double().square().mean()) for x in angles]
+errors = [1e3 * float((x - unseen.values)[~holes].double().square().mean()) for x in chain]
 figure, (left, right) = plt.subplots(
     1, 2, figsize=(11, 3.6), width_ratios=(1, 2.2), layout="constrained"
 )
@@ -318,8 +304,8 @@ left.set(
     xlabel="passes k", ylabel="MSE / 10⁻³ rad²", ylim=(0, None), title="error of the hidden joints"
 )
 left.legend(frameon=False)
-frame = int((angles[0] - unseen.values)[0].square().sum(-1).argmax())
-steps = torch.stack([x[0, frame] for x in (*angles[:5], unseen.values)])
+frame = int((chain[0] - unseen.values)[0].square().sum(-1).argmax())
+steps = torch.stack([x[0, frame] for x in (*chain[:5], unseen.values)])
 posture_strip(right, steps, unseen.channels, every=1)
 right.set_xticklabels(["k = 0 (mean)", "1", "2", "3", "4", "truth"])
 right.set_title(f"frame {frame} of an unseen movement, pass by pass")
@@ -327,7 +313,7 @@ plt.show()
 
 # %% [markdown]
 # A pass costs nothing and one or two are enough; what is left is what the small network does not
-# know of movements it never saw. The stored experiment therefore keeps *trained on* (what the
+# know of held-out movements. The stored experiment therefore keeps *trained on* (what the
 # thesis reports) and *held out* apart, and asks other models the same, by conditioning. Its last
 # column is the share of hidden angles inside the 90 % band, as the models give it: not calibrated.
 

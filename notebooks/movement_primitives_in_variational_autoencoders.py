@@ -58,7 +58,6 @@ from zoo.evaluation.figures.postures import posture_map, posture_strips
 from zoo.faces.screening import screen_run
 from zoo.movement.template import match
 from zoo.nn.metric import sensitivity
-from zoo.prediction.predictive import Predictive
 from zoo.studies import stored
 
 real = bool(os.environ.get("MOVEZOO_DATA"))
@@ -188,12 +187,10 @@ def grid(points: int) -> torch.Tensor:
     return torch.stack(torch.meshgrid(*sides, indexing="xy"), -1)
 
 
-decoder, radians = plane.model.decoder, plane.scaler.channel_scale.float()
-norm = sensitivity(lambda z: decoder(z) * radians, grid(120))
+radians = plane.scaler.channel_scale.float()
+norm = sensitivity(lambda z: plane.model.decode(z).location * radians, grid(120))
 coarse = grid(5)
-with torch.no_grad():
-    angles = decoder(coarse)
-postures = plane.exchange.unscaled(Predictive(location=angles[None]), "reconstruct").location[0]
+postures = plane.decode(coarse).mean
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(12, 5.4), layout="constrained")
 extent = [float(v) for pair in zip(corner, opposite, strict=True) for v in pair]
@@ -307,7 +304,7 @@ stored("E6.4")
 # a recording begins. A forecast weighs every phase and many tempos by what was seen.
 #
 # Here: twelve walks of subject 35 to learn from, four to judge (simulated: an arm that stirs,
-# twenty times to learn from). Less than a second is seen, and two are foretold.
+# twenty times to learn from). Less than a second is observed, and two are forecast.
 
 # %%
 if real:
@@ -353,7 +350,7 @@ low, high = forecast.interval(0.9)
 figure, panels = plt.subplots(1, 3, figsize=(12, 3), sharey=True, layout="constrained")
 for k, axes in enumerate(panels):
     axes.plot(seconds, unseen.values[k, :, column], "k:", label="what came")
-    axes.plot(seconds[:short], unseen.values[k, :short, column], "k", label="seen")
+    axes.plot(seconds[:short], unseen.values[k, :short, column], "k", label="observed")
     axes.plot(seconds[short:], forecast.mean[k, :, column], color="C1", label="forecast")
     band = (low[k, :, column], high[k, :, column])
     axes.fill_between(seconds[short:], *band, color="C1", alpha=0.25, lw=0, label="90 % band")

@@ -22,7 +22,7 @@ from torch import Tensor
 from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs, Sequences
 from zoo.evaluation.questions import Setup, hide_joints, hide_section
-from zoo.evaluation.tasks import trials
+from zoo.evaluation.tasks import outcomes
 from zoo.inference.elbo import bound
 from zoo.inference.loader import Loader, stream, whole
 from zoo.inference.posterior import GuidePosterior
@@ -254,7 +254,7 @@ def check_blind(run: Run, task: str) -> None:
     data = data_of(run.assembly.entry)
     hidden, noisy = _noisy(data, task)
     setup = Setup(seen=SEEN, horizon=HORIZON, draws=8)
-    (asked,), (blind,) = (trials(run, d, [task], setup) for d in (data, noisy))
+    (asked,), (blind,) = (outcomes(run, d, [task], setup) for d in (data, noisy))
     values = data.targets if isinstance(data, Pairs) else data.values
     if task == "forecast":
         hidden, values = (v[:, SEEN : SEEN + HORIZON] for v in (hidden, values))

@@ -240,7 +240,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="last-value",
-            summary="The last value held, with the spread of every lead time",
+            summary="The last value held, with the standard deviation of every lead time",
             thesis="baseline, not in the thesis",
             model="zoo.models.baselines.last_value:LastValue",
             guide=None,
@@ -270,7 +270,7 @@ CATALOGUE = Registry(
         ),
         Entry(
             name="kernel-ridge",
-            summary="Missing and future entries regressed on those seen, by kernel ridge",
+            summary="Missing and future entries regressed on those observed, by kernel ridge",
             thesis="baseline, not in the thesis",
             model="zoo.models.baselines.kernel_ridge:KernelRidge",
             guide=None,

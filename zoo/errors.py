@@ -55,7 +55,7 @@ class NotFittedError(RuntimeError):
 
 
 class NoSpreadError(ValueError):
-    """A spread was asked of a deterministic prediction."""
+    """A standard deviation was asked of a deterministic prediction."""
 
 
 class NoDensityError(ValueError):

@@ -135,7 +135,7 @@ def test_files_that_are_not_what_they_should_be(tmp_path: Path, name: str) -> No
 
 
 def test_what_is_not_there_or_has_no_rate(tmp_path: Path) -> None:
-    with pytest.raises(MissingDataError, match=r"there is no file walk.csv, seen from"):
+    with pytest.raises(MissingDataError, match=r"there is no file walk.csv in "):
         zoo.load_data("walk.csv")
     with pytest.raises(MissingDataError, match=r"holds no file named \.csv"):
         zoo.load_data(tmp_path)

@@ -243,7 +243,7 @@ def test_classes_say_what_they_lack() -> None:
     kind = cell()["Level"]
     zoo.register(entry_of(kind))
     with pytest.raises(ValueError, match="level names no data set of its own: give one"):
-        zoo.faces.commands.Plan.parse("level", None, [], None, ".6,.1,.15,.15", 0, "none", "cpu")
+        zoo.faces.commands.Recipe.parse("level", None, [], None, ".6,.1,.15,.15", 0, "none", "cpu")
     del kind.dtype
     with pytest.raises(TypeError, match="Level needs a class attribute dtype"):
         zoo.create("level", movements())

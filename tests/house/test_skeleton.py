@@ -66,6 +66,6 @@ def test_missing_entries_are_no_part_of_it(skeleton: tuple[str, zoo.Run]) -> Non
     holed = data_of(run.assembly.entry, missing=True)
     made = assemble(run.assembly.entry, holed.layout, SETTINGS[kind], seed=0, device="cpu")
     again = zoo.fit(made, holed)
-    trials = zoo.evaluation.tasks.trials(again, data_of(run.assembly.entry)[:4])
-    assert all(bool(t.prediction.mean.isfinite().all()) for t in trials)
-    assert {u for t in trials for u in t.prediction.units} <= {"rad", "N"}
+    outcomes = zoo.evaluation.tasks.outcomes(again, data_of(run.assembly.entry)[:4])
+    assert all(bool(t.prediction.mean.isfinite().all()) for t in outcomes)
+    assert {u for t in outcomes for u in t.prediction.units} <= {"rad", "N"}

@@ -16,16 +16,16 @@ from sklearn.isotonic import IsotonicRegression
 
 from zoo.errors import FewGroupsWarning, NoDensityError, UnknownNameError
 from zoo.evaluation.answers import Answer
-from zoo.evaluation.calibration.factors import crossed, standardised
+from zoo.evaluation.calibration.conformal import Conformal
 from zoo.evaluation.calibration.pool import Pool
 from zoo.evaluation.calibration.promise import promised
 from zoo.evaluation.calibration.recalibration import (
     RECALIBRATIONS,
-    Conformal,
-    Scale,
     recalibrate,
     recalibration_from_state,
 )
+from zoo.evaluation.calibration.scale import Scale
+from zoo.evaluation.calibration.stretch import crossed, standardised
 from zoo.evaluation.scores import score
 from zoo.prediction.prediction import Prediction
 from zoo.prediction.predictive import Predictive
@@ -114,7 +114,7 @@ def test_scale_is_the_maximum_of_the_likelihood() -> None:
     raw = items(truth, noise=torch.full((1,), 2.0).double())
     found = recalibrate("scale", raw, truth, by=())
     assert isinstance(found, Scale)
-    factor = float(found.factors.of(raw)[0])
+    factor = float(found.stretch.of(raw)[0])
     assert factor == pytest.approx(float((truth / 2).square().mean().sqrt()))
 
     def likelihood(by: float) -> float:
@@ -131,13 +131,13 @@ def test_channel_factors_follow_many_groups_and_shrink_with_few() -> None:
     raw = items(truth, noise=torch.ones(3).double())
     many = recalibrate("scale", raw, truth)
     assert isinstance(many, Scale)
-    torch.testing.assert_close(many.factors.of(raw), spreads, rtol=0.06, atol=0)
+    torch.testing.assert_close(many.stretch.of(raw), spreads, rtol=0.06, atol=0)
     equal = torch.randn(6, 30, generator=generator, dtype=torch.float64)
     few = items(equal, noise=torch.ones(30).double())
     shrunk = recalibrate("scale", few, equal)
     assert isinstance(shrunk, Scale)
     own = equal.square().mean(0).log().std()
-    assert float(shrunk.factors.channel.square().log().std()) < 0.5 * float(own)
+    assert float(shrunk.stretch.channel.square().log().std()) < 0.5 * float(own)
 
 
 def test_isotonic_is_the_isotonic_regression_of_the_pit() -> None:
@@ -318,7 +318,7 @@ def test_what_cannot_be_calibrated_is_refused_with_its_reason() -> None:
     with pytest.raises(ValueError, match="5 channels; this recalibration was fitted on 6"):
         other.recalibrated(found).quantile(0.9)
     still = items(torch.zeros(5, 1), noise=torch.zeros(1).double())
-    with pytest.raises(ValueError, match="spread of 0"):
+    with pytest.raises(ValueError, match="standard deviation of 0"):
         recalibrate("scale", still, torch.ones(5, 1))
 
 

@@ -164,7 +164,7 @@ def test_a_model_that_cannot_be_judged_is_a_line_too(
     """What scoring refuses, such as a standard deviation of 0, is that model's error."""
 
     def refused(*_: object) -> None:
-        raise ValueError("12 known entries are predicted with a spread of 0")
+        raise ValueError("12 known entries are predicted with a standard deviation of 0")
 
     monkeypatch.setattr(board, "judged", refused)
     with pytest.raises(ValueError, match="no model could answer tiny: ValueError: 12 known"):

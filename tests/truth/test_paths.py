@@ -36,7 +36,7 @@ def one_of_each(values: Tensor) -> Tensor:
     return later.gather(1, picked(later.shape[1], 12)[:, None])[:, 0]
 
 
-def test_paths_between_those_known_are_foretold_with_the_right_bands() -> None:
+def test_paths_between_those_known_are_forecast_with_the_right_bands() -> None:
     """PIT values of the mixture after four of ten frames."""
     paths = white(5, TIME, LATENT, seed=1).cumsum(1)
     spread = white(LATENT, TIME, TIME, seed=2)
@@ -53,7 +53,7 @@ def test_paths_between_those_known_are_foretold_with_the_right_bands() -> None:
     check_uniform(one_of_each((weight * below).sum(1)))
 
 
-def test_cycles_of_unknown_timing_are_foretold_with_the_right_bands() -> None:
+def test_cycles_of_unknown_timing_are_forecast_with_the_right_bands() -> None:
     """Ranks among the draws after four of ten frames."""
     designs = white(6, TIME, 3, seed=1)
     parameters = white(4, 3, LATENT, seed=2)

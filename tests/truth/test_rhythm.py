@@ -236,7 +236,7 @@ def test_cycles_repeat_after_a_period_and_centres_move() -> None:
 
 
 def test_forecasts_of_a_new_phase_and_tempo_go_on_where_it_stands() -> None:
-    """Trained briefly on nine swings, a tenth is foretold for a period and more."""
+    """Trained briefly on nine swings, a tenth is forecast for a period and more."""
     generator = np.random.default_rng(0)
     phase = torch.from_numpy(generator.uniform(-3, 3, 12))
     tempo = torch.from_numpy(generator.normal(0, 0.04, 12))

@@ -7,7 +7,7 @@ finds it, and nothing else is declared. What every model has besides is in
 All tensors are in the model's own scale and dtype; the run scales on the way in and out.
 ``posterior`` is the guide behind the :class:`~zoo.types.Posterior` protocol, or None for
 baselines, which have no guide. A batch given for prediction holds whole movements of one length,
-starting at frame 0 (``batch.start == 0``); what a forecast has seen is exactly ``batch.values``.
+starting at frame 0 (``batch.start == 0``); what a forecast observes is exactly ``batch.values``.
 ``draws`` is how many joint draws to make; 0 asks for the moments alone.
 """
 
@@ -22,6 +22,8 @@ from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Posterior, Wishes
 
 __all__ = [
+    "Decodes",
+    "Encodes",
     "FollowsPhase",
     "Forecasts",
     "Generates",
@@ -53,6 +55,26 @@ class Represents(Protocol):
 
 
 @runtime_checkable
+class Encodes(Protocol):
+    """Latent coordinates of frames, of a model whose ``represent`` says more than they do."""
+
+    def encode(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """p(z_t | x_t), shape (sequence, time, latent)."""
+        ...
+
+
+@runtime_checkable
+class Decodes(Protocol):
+    """Frames of latent coordinates, such as :meth:`Represents.represent` gives them."""
+
+    latent_dim: int
+
+    def decode(self, z: Float[Tensor, "sample sequence time latent"], /) -> Predictive:
+        """p(x_t | z_t), shape (sequence, time, channel)."""
+        ...
+
+
+@runtime_checkable
 class Reconstructs(Protocol):
     """Observed movements through the model."""
 
@@ -63,7 +85,7 @@ class Reconstructs(Protocol):
 
 @runtime_checkable
 class Forecasts(Protocol):
-    """The frames after those seen."""
+    """The frames after those observed."""
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int

@@ -28,7 +28,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A prediction and what came true: ``mask`` is True where the truth is known and inside.
+    """A prediction and the truth: ``mask`` is True where the truth is known and inside.
 
     ``cluster`` numbers the group of each sequence or item: entries of one group are dependent.
     """

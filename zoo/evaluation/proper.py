@@ -82,7 +82,7 @@ def variogram_scores(draws: Tensor, answer: Answer) -> Float[Tensor, "pair seque
 
 
 def _normal_crps(mean: Tensor, std: Tensor, truth: Tensor) -> Tensor:
-    """Without a spread, as in frames beyond a movement's end, it is the distance."""
+    """Without a standard deviation, as in frames beyond a movement's end, it is the distance."""
     parts = _arrays(truth, mean, torch.where(std > 0, std, 1.0))
     distance = (truth.double() - mean.double()).abs()
     return torch.where(std > 0, _tensor(scoringrules.crps_normal(*parts)).to(distance), distance)

@@ -20,7 +20,7 @@ __all__ = ["NEEDS", "Question", "Setup", "ask", "beginning", "hide_joints", "hid
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """How the tasks are posed: what a forecast sees, and which entries are missing.
+    """How the tasks are posed: which frames a forecast gets, and which entries are missing.
 
     ``hidden`` are the channels that "impute joints" hides throughout: a share of them, drawn by
     ``seed``, or names, where that of a joint stands for all its channels (``rfemur`` for
@@ -53,7 +53,7 @@ class Setup:
         seed_of(self.seed)
 
     def frames(self, data: Sequences, *, beyond: bool = False) -> tuple[int, int]:
-        """Frames seen and frames to forecast; by default a seventh is seen (10 of 70).
+        """Frames observed and frames to forecast; by default a seventh is observed (10 of 70).
 
         The forecast ends where the shortest movement does, unless it may go ``beyond``.
         """

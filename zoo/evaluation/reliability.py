@@ -35,7 +35,7 @@ class Reliability:
 
     @classmethod
     def of(cls, answer: Answer) -> Self:
-        """Reliability of a prediction that has a spread."""
+        """Reliability of a prediction that has a standard deviation."""
         pit = answer.prediction.cdf(answer.truth).double()
         inside = (2 * pit - 1).abs()[..., None] <= _GRID.to(pit)
         below = pit[..., None] <= _GRID.to(pit)

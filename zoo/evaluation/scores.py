@@ -1,4 +1,4 @@
-"""Scores of a prediction against what came true: errors, proper scores and calibration."""
+"""Scores of a prediction against the truth: errors, proper scores and calibration."""
 
 from __future__ import annotations
 

@@ -14,13 +14,13 @@ from zoo.evaluation.questions import NEEDS, Question, Setup, ask
 from zoo.prediction.prediction import Prediction
 
 __all__ = [
+    "Outcome",
     "Predictor",
     "Trained",
-    "Trial",
     "answered",
+    "outcomes",
     "posed",
     "tasks_of",
-    "trials",
 ]
 
 
@@ -41,7 +41,7 @@ class Predictor(Protocol):
         ...
 
     def forecast(self, data: Sequences, *, horizon: int, draws: int, seed: int) -> Prediction:
-        """The frames after those seen."""
+        """The frames after those observed."""
         ...
 
     def impute(self, data: Sequences, *, draws: int, seed: int) -> Prediction:
@@ -69,7 +69,7 @@ class Trained(Predictor, Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trial:
+class Outcome:
     """One answer and its truth; ``mask`` is True where the truth is known and was asked for."""
 
     task: str
@@ -91,12 +91,12 @@ def answered(run: Predictor, question: Question, *, draws: int, seed: int) -> Pr
     return run.impute(given, draws=draws, seed=seed)
 
 
-def trials(
+def outcomes(
     run: Predictor,
     data: Pairs | Sequences,
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
-) -> list[Trial]:
+) -> list[Outcome]:
     """Pose every task that the run's model can do, or those named, on ``data``.
 
     A task without an answer on these data is left out, see :func:`posed`.
@@ -109,17 +109,17 @@ def posed(
     data: Pairs | Sequences,
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
-) -> tuple[list[Trial], dict[str, str]]:
+) -> tuple[list[Outcome], dict[str, str]]:
     """The answers to every task that the model can do, or to those named, and why others have none.
 
     Where no task has an answer the first one's UnanswerableError is raised.
     """
-    found: list[Trial] = []
+    found: list[Outcome] = []
     refused: dict[str, UnanswerableError] = {}
     how = setup or Setup()
     for name in tasks_of(run, tasks):
         try:
-            found.append(_trial(run, ask(name, data, how), how))
+            found.append(_outcome(run, ask(name, data, how), how))
         except UnanswerableError as error:
             refused[name] = error
     if refused and not found:
@@ -140,8 +140,8 @@ def tasks_of(run: Predictor, tasks: Sequence[str] | None = None) -> list[str]:
     return names
 
 
-def _trial(run: Predictor, question: Question, setup: Setup) -> Trial:
-    return Trial(
+def _outcome(run: Predictor, question: Question, setup: Setup) -> Outcome:
+    return Outcome(
         task=question.task,
         prediction=answered(run, question, draws=setup.draws, seed=setup.seed),
         truth=question.truth,

@@ -128,21 +128,21 @@ def fit(
     figure: Figure = None,
     json: Json = False,
 ) -> None:
-    """Train a model on four-way split data and calibrate its spreads on movements unseen.
+    """Train a model on four-way split data and calibrate its bands on held-out movements.
 
     Example: `zoo fit vae-dmp --data cmu-mocap/35-walk --set latent_dim=5 --run-dir runs/walk`
 
     Of one's own: `zoo fit promp --data walk.csv --run-dir runs/own --figure bands.png`
     """
-    from zoo.faces.commands import Plan, forecast_report, train
+    from zoo.faces.commands import Recipe, forecast_report, train
     from zoo.faces.tables import print_json, report_table
     from zoo.runs.run import evaluate as score
 
-    plan = Plan.parse(model, data, settings or [], by, parts, seed, calibrate, device, rate)
+    recipe = Recipe.parse(model, data, settings or [], by, parts, seed, calibrate, device, rate)
     advice = "repeat the command with --resume to go on from the last checkpoint, if there is one"
     with interruptible(advice):
-        run = train(plan, run_dir, resume=resume, overwrite=overwrite, progress=not json)
-    test = plan.load()[3]
+        run = train(recipe, run_dir, resume=resume, overwrite=overwrite, progress=not json)
+    test = recipe.load()[3]
     if output is not None or figure is not None:
         forecast_report(run, test, seen=None, horizon=None, output=output, figure=figure)
     if json:
@@ -209,7 +209,7 @@ def play_command(
     start: Annotated[int, typer.Option(help="With --onto: frame where it begins.")] = 20,
     steps: Annotated[int, typer.Option(help="With --onto: frames it takes.")] = 18,
 ) -> None:
-    """Play a movement in a page: data, reconstruction, forecast with its spread, and a switch."""
+    """Play a movement in a page: data, reconstruction, forecast with its bands, and a switch."""
     from zoo.faces.screening import screen
 
     player = screen(

@@ -1,4 +1,4 @@
-"""What the command line and the demo do with a run: plan, train, reopen, forecast and draw."""
+"""What the command line and the demo do with a run: train, reopen, forecast and draw."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.answers import clusters
 from zoo.evaluation.questions import Setup, beginning
-from zoo.evaluation.tasks import trials
+from zoo.evaluation.tasks import outcomes
 from zoo.prediction.prediction import Prediction
 from zoo.runs.assembly import create
 from zoo.runs.fitting import fit
 from zoo.runs.run import Run, load
 from zoo.runs.units import fingerprints
 
-__all__ = ["ForecastReport", "Plan", "forecast_report", "open_run", "reliability_figure", "train"]
+__all__ = ["ForecastReport", "Recipe", "forecast_report", "open_run", "reliability_figure", "train"]
 
 _PLAN = "plan.json"
 _WORDS = {"none": None, "null": None, "true": True, "false": False}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class Recipe:
     """What ``zoo fit`` was asked for; kept beside the run so that its test part can be found."""
 
     model: str
@@ -58,8 +58,8 @@ class Plan:
         calibrate: str,
         device: str,
         rate: float | None = None,
-    ) -> Plan:
-        """A plan from the words of a command line; each is checked and named when wrong."""
+    ) -> Recipe:
+        """A recipe from the words of a command line; each is checked and named when wrong."""
         methods = ("conformal", "isotonic", "scale", "none")
         if calibrate not in methods:
             raise ValueError(f"--calibrate is one of {', '.join(methods)}; got {calibrate!r}")
@@ -84,8 +84,8 @@ class Plan:
         return train, val, calib, test
 
     @classmethod
-    def kept(cls, folder: Path) -> Plan | None:
-        """The plan that a folder's training followed."""
+    def kept(cls, folder: Path) -> Recipe | None:
+        """The recipe that a folder's training followed."""
         path = folder / _PLAN
         if not path.is_file():
             return None
@@ -93,24 +93,26 @@ class Plan:
             saved = json.loads(path.read_text(encoding="utf-8"))
             return cls(**{**saved, "parts": tuple(saved["parts"])})
         except (ValueError, TypeError, KeyError) as error:
-            raise DamagedRunError(f"{path} is not a plan of `zoo fit`: {error}") from None
+            raise DamagedRunError(f"{path} is not a recipe of `zoo fit`: {error}") from None
 
 
 def train(
-    plan: Plan,
+    recipe: Recipe,
     folder: Path,
     *,
     resume: bool = False,
     overwrite: bool = False,
     progress: bool = False,
 ) -> Run:
-    """Fit, calibrate and save as planned.
+    """Fit, calibrate and save by a recipe.
 
     A folder that holds a training is taken only to ``resume`` the same one, or to ``overwrite``
     it, see :func:`zoo.fit`.
     """
-    train, val, calib, _ = plan.load()
-    assembly = create(plan.model, train, seed=plan.seed, device=plan.device, **plan.settings)
+    train, val, calib, _ = recipe.load()
+    assembly = create(
+        recipe.model, train, seed=recipe.seed, device=recipe.device, **recipe.settings
+    )
     run = fit(
         assembly,
         train,
@@ -120,9 +122,9 @@ def train(
         overwrite=overwrite,
         progress=progress,
     )
-    archive.replace_file(folder / _PLAN, json.dumps(asdict(plan), indent=1).encode())
-    if plan.calibrate != "none" and _enough(calib):
-        run.calibrate(calib, method=plan.calibrate)  # type: ignore[arg-type]
+    archive.replace_file(folder / _PLAN, json.dumps(asdict(recipe), indent=1).encode())
+    if recipe.calibrate != "none" and _enough(calib):
+        run.calibrate(calib, method=recipe.calibrate)  # type: ignore[arg-type]
     run.save(folder)
     return run
 
@@ -132,7 +134,7 @@ def _enough(calib: Pairs | Sequences) -> bool:
     if count < 2:
         warnings.warn(
             f"the calibration part holds {count} movement or item and at least 2 are needed: "
-            "spreads stay as the model gives them (more data, or other --parts)",
+            "bands stay as the model gives them (more data, or other --parts)",
             stacklevel=3,
         )
     return count >= 2
@@ -149,12 +151,12 @@ def open_run(folder: Path, data: str | None = None) -> tuple[Run, Any]:
         rate = run.assembly.layout.rate
         given: dict[str, Any] = {"rate": rate} if rate and means_file(data) else {}
         return run, load_data(data, **given)
-    plan = Plan.kept(folder)
-    return run, _unseen(run, folder) if plan is None else plan.load()[3]
+    recipe = Recipe.kept(folder)
+    return run, _unseen(run, folder) if recipe is None else recipe.load()[3]
 
 
 def _unseen(run: Run, folder: Path) -> Any:
-    """What a run without a plan has not seen of the data that it names."""
+    """What is held out, for a run without a recipe, of the data that it names."""
     name, known = run.trained_on["name"], run.trained_on["fingerprints"]
     advice = f"{folder} holds no {_PLAN}: name a data set with --data"
     try:
@@ -259,7 +261,7 @@ def reliability_figure(run: Run, data: Pairs | Sequences, path: Path) -> None:
     """Draw nominal against observed coverage of every task."""
     from zoo.evaluation.figures.bands import reliability
 
-    answers = [t for t in trials(run, data) if t.prediction.has_spread]
+    answers = [t for t in outcomes(run, data) if t.prediction.has_spread]
     lines = {t.task: (t.prediction, t.truth, t.mask, t.groups) for t in answers}
     reliability(lines).savefig(path, dpi=150)
 

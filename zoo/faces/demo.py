@@ -42,7 +42,7 @@ def main(folder: Path = Path("demo")) -> int:
     train, val, calib, test = data.split(by="trial", parts=shares, seed=0)
     console.print(
         f"[bold]{data.name}[/] ({data.provenance}): {len(train)} movements to train on, "
-        f"{len(val)} to validate, {len(calib)} to calibrate, {len(test)} never seen"
+        f"{len(val)} to validate, {len(calib)} to calibrate, {len(test)} held out"
     )
     assembly = create("vae-dmp", train, max_steps=STEPS)
     run = fit(assembly, train, val=val, run_dir=folder / "run", overwrite=True, progress=True)

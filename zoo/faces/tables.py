@@ -111,7 +111,7 @@ def _numbers(value: Any) -> list[str]:
 
 
 def _rate(data: Sequences) -> str:
-    return f"{data.rate:.4g} Hz{' in the mean' if data.time_normalised else ''}"
+    return f"{data.rate:.4g} Hz{' on average' if data.time_normalised else ''}"
 
 
 def _present(data: Pairs | Sequences) -> float:

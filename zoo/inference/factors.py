@@ -24,7 +24,7 @@ class Factors:
     def posterior(
         self, values: Float[Tensor, "frame channel"], mask: Bool[Tensor, "frame channel"] | None
     ) -> tuple[Float[Tensor, "frame latent"], Float[Tensor, "frame latent latent"]]:
-        """Mean and covariance of p(z | x_seen): M = W'W + σ²I over the seen rows, σ²M⁻¹."""
+        """Mean and covariance of p(z | x_seen): M = W'W + σ²I over the observed rows, σ²M⁻¹."""
         factor, pattern = self._factor(mask, len(values))
         residual = _seen(values - self.mean, mask) @ self.loading
         mean = torch.cholesky_solve(residual[..., None], factor[pattern])[..., 0]
@@ -48,7 +48,7 @@ class Factors:
     def _factor(
         self, mask: Tensor | None, frames: int
     ) -> tuple[Float[Tensor, "pattern latent latent"], Tensor]:
-        """M's Cholesky factor once for every pattern of seen channels, and each frame's pattern."""
+        """M's Cholesky factor for every pattern of observed channels, and each frame's pattern."""
         if mask is None:
             patterns = torch.ones_like(self.mean)[None]
             index = torch.zeros(frames, dtype=torch.long, device=self.mean.device)
@@ -83,10 +83,10 @@ def expectation_maximisation(
     iterations: int,
     tolerance: float,
 ) -> Factors:
-    """Maximum likelihood from the entries seen, started from the closed form on filled means.
+    """Maximum likelihood from the observed entries, started from the closed form on filled means.
 
-    It ends when the evidence grows by less than ``tolerance`` nats a seen entry, and warns where
-    that is not reached within ``iterations``. W is rotated to its principal axes.
+    It ends when the evidence grows by less than ``tolerance`` nats per observed entry, and
+    warns where that is not reached within ``iterations``. W is rotated to its principal axes.
     """
     seen = _seen(values, mask)
     mean = seen.sum(0) / mask.sum(0)

@@ -28,7 +28,7 @@ def laplace(
 ) -> MultivariateNormal:
     r"""p(z | x) of z ~ N(0, I), x ~ N(decode(z), diag std²), as a Gaussian at its mode.
 
-    Entries whose ``std`` is infinite count as not seen. Modes are sought by Levenberg and
+    Entries whose ``std`` is infinite count as missing. Modes are sought by Levenberg and
     Marquardt's method from ``start`` and from ``restarts`` draws of the prior. Of those that miss x
     by no more than twice what the best does, or by six standard deviations, the nearest to
     ``start`` is taken: what a decoder maps alike is told apart by that. Without ``near`` it is the

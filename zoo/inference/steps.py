@@ -1,4 +1,4 @@
-"""Single steps of variational inference: checked once, seeded by place, blamed by name."""
+"""Single steps of variational inference: checked once, seeded by place, with named errors."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def runge_kutta(
 ) -> tuple[Float[Tensor, "2 2"], Float[Tensor, "2 3"]]:
     """The same system by classical Runge-Kutta steps of fourth order, in float64.
 
-    The second factor multiplies αβ g + f at the begin, the middle and the end of a step.
+    The second factor multiplies αβ g + f at the beginning, the middle and the end of a step.
     """
     dt, eye = system.dt, torch.eye(2, dtype=torch.float64)
     spring, damping = system.stiffness / system.tau**2, system.alpha / system.tau

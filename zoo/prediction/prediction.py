@@ -22,7 +22,7 @@ Axes = tuple[str, ...]
 
 
 class Recalibration(Protocol):
-    """A correction of a predictive distribution, fitted on data that the model never saw."""
+    """A correction of a predictive distribution, fitted on held-out data."""
 
     def quantile(self, raw: Prediction, level: float) -> Tensor:
         """Corrected quantile of every coordinate."""
@@ -52,7 +52,7 @@ class Prediction:
     ``axes`` is ``("sequence", "time", "channel")`` or ``("item", "target")``; ``names`` and
     ``units`` label the last axis; ``task`` says which question was answered and ``offset`` at
     which frame a forecast begins. Deterministic predictions raise
-    :class:`~zoo.errors.NoSpreadError` wherever a spread is needed.
+    :class:`~zoo.errors.NoSpreadError` wherever a standard deviation is needed.
     """
 
     predictive: Predictive
@@ -83,7 +83,7 @@ class Prediction:
         sizes = ", ".join(f"{a} {n}" for a, n in zip(self.axes, self.shape, strict=True))
         units = "/".join(dict.fromkeys(u for u in self.units if u)) or "no unit"
         spread = "with spread" if self.has_spread else "without spread"
-        kind = "" if self.recalibration is None else f", {type(self.recalibration).__name__}"
+        kind = "" if self.recalibration is None else ", calibrated"
         return f"Prediction of {self.task}: {sizes}; in {units}, {spread}{kind}"
 
     @property
@@ -227,13 +227,15 @@ class Prediction:
         )
 
     def recalibrated(self, recalibration: Recalibration) -> Self:
-        """This prediction with its spread corrected."""
+        """This prediction with its bands corrected."""
         self._need_spread()
         return replace(self, recalibration=recalibration)
 
     def _need_spread(self) -> None:
         if not self.has_spread:
-            raise NoSpreadError(f"this {self.task} prediction is deterministic: it has no spread")
+            raise NoSpreadError(
+                f"this {self.task} prediction is deterministic: it has no standard deviation"
+            )
 
     def _mixture(self) -> Predictive:
         mixture = self.effective

@@ -74,7 +74,7 @@ class Predictive:
     ``location`` has a leading ``component`` axis (1 for a Gaussian or a deterministic model).
     ``noise`` is the aleatoric standard deviation, broadcastable to ``location``; None says that
     the model has none to give. ``epistemic`` is a further standard deviation of the mean where a
-    model knows it in closed form; the spread of the components counts as epistemic too.
+    model knows it in closed form; the variance between components counts as epistemic too.
     ``joint`` says that each component is one joint trajectory; ``draws`` are joint draws of the
     noise-free path where the moments themselves are exact, or :class:`Deferred` ones.
     """

@@ -67,7 +67,7 @@ class Answers(ABC):
     @property
     @abstractmethod
     def fingerprints(self) -> list[str]:
-        """Those of the movements or items that training saw."""
+        """Those of the movements or items that were trained on."""
         ...
 
     @abstractmethod
@@ -149,7 +149,7 @@ class Answers(ABC):
         by: str | None = None,
         adapt: bool = True,
     ) -> Self:
-        """Fit and keep a correction of every spread on movements that training never saw.
+        """Fit and keep a correction of the bands on held-out movements.
 
         ``setup`` says how the tasks will be posed, such as which channels will be missing; without
         it forecasts are calibrated after a grid of observed lengths, and what is asked between two

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 from pydantic import TypeAdapter
 
 from zoo import archive
 from zoo.datasets.records import Pairs, Sequences
-from zoo.errors import DamagedRunError
+from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.calibration.calibration import Calibration
 from zoo.prediction.prediction import Prediction
 from zoo.prediction.predictive import pooled
@@ -24,6 +24,7 @@ from zoo.runs.rundir import Resume
 __all__ = ["Ensemble", "fit_ensemble"]
 
 FORMAT_VERSION = 2
+_OWN = "every member has latent coordinates of its own; ask one of its members"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class Ensemble(Answers):
     p(y | x) = 1/M Σ_m p_m(y | x)
 
     Lakshminarayanan, Pritzel & Blundell, *Simple and scalable predictive uncertainty estimation
-    using deep ensembles*, NIPS 2017. Members that are deterministic, such as ae-dmp, get a spread
+    using deep ensembles*, NIPS 2017. Members that are deterministic, such as ae-dmp, get bands
     here: that of the members, and with few of them a coarse one, so that it wants calibration. The
     members may be of different entries. Latent coordinates of different members mean different
     things: an ensemble does not represent. The members' own calibrations are not used; the
@@ -84,7 +85,7 @@ class Ensemble(Answers):
 
     @property
     def fingerprints(self) -> list[str]:
-        """Those of the movements or items that a member saw in training."""
+        """Those of the movements or items that a member was trained on."""
         return sorted({f for run in self.members for f in run.fingerprints})
 
     def uncorrected(self, query: Query) -> Prediction:
@@ -100,6 +101,14 @@ class Ensemble(Answers):
 
     def _keep(self, calibration: Calibration) -> None:
         self.calibration = calibration
+
+    def encode(self, data: Sequences) -> NoReturn:
+        """Refused: members have latent coordinates of their own; ask one of :attr:`members`."""
+        raise NotCapableError(f"{self.name} cannot encode: {_OWN}")
+
+    def decode(self, latent: object) -> NoReturn:
+        """Refused as :meth:`encode` is."""
+        raise NotCapableError(f"{self.name} cannot decode: {_OWN}")
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the members and the ensemble's calibration as folders of safetensors and JSON.

@@ -8,9 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
 
+from zoo.arguments import whole_number
+from zoo.contract.capabilities import Decodes, Encodes
 from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.errors import NotCapableError
 from zoo.evaluation.calibration.calibration import Calibration
 from zoo.evaluation.questions import Setup
 from zoo.evaluation.scores import score
@@ -20,11 +25,11 @@ from zoo.inference.loader import whole
 from zoo.inference.resume.lock import free
 from zoo.prediction.prediction import Prediction
 from zoo.prediction.predictive import Predictive
-from zoo.runs.answering import Answers, Query
+from zoo.runs.answering import Answers, Query, Task
 from zoo.runs.assembly import create
 from zoo.runs.disk import load_run, save_run
 from zoo.runs.record import Record
-from zoo.runs.units import Answer, Exchange, check_unseen
+from zoo.runs.units import Ask, Exchange, check_unseen
 from zoo.streams import seeded
 from zoo.types import Wishes
 
@@ -65,7 +70,7 @@ class Run(Record, Answers):
 
     @property
     def fingerprints(self) -> list[str]:
-        """Those of the movements or items that training saw."""
+        """Those of the movements or items that were trained on."""
         found: list[str] = self.trained_on["fingerprints"]
         return found
 
@@ -73,20 +78,80 @@ class Run(Record, Answers):
         """The answer without the correction of its bands."""
         if query.task == "regress":
             return self._regressed(query)
-        latent = query.task == "represent"
         found, frames = self.exchange.answer(query.data, self._method(query), query.seed)
-        layout, count = self.assembly.layout, found.location.shape[-1]
-        numbers = tuple(f"z_{i + 1}" for i in range(count))
+        if query.task == "represent":
+            return _latent(found, query.data.rate, frames)
         ahead = query.task == "forecast"
-        return Prediction(
-            predictive=found if latent else self.exchange.unscaled(found, query.task),
-            axes=("sequence", "time", "latent" if latent else "channel"),
-            names=numbers if latent else layout.channels,
-            units=("",) * count if latent else layout.units,
-            task=query.task,
-            rate=query.data.rate if latent else layout.rate,
+        return self._frames(
+            self.exchange.unscaled(found, query.task),
+            query.task,
             offset=int(query.data.lengths.max()) if ahead else 0,
             lengths=None if ahead else frames,
+        )
+
+    def encode(
+        self, data: Sequences, *, draws: int = 200, seed: int = 0
+    ) -> tuple[Float[Tensor, "sequence time latent"], Float[Tensor, "sequence time latent"]]:
+        """Means and standard deviations of the latent coordinates of every frame, in their units.
+
+        They are those of :meth:`represent`, 0 where the model gives no standard deviation. Of a
+        primitive in an autoencoder they are the encoder's, which the primitive has not smoothed.
+        Frames after the end of a shorter movement hold 0. Raises NotCapableError where the model
+        has no latent coordinates.
+
+        >>> import numpy as np, zoo
+        >>> x = np.random.default_rng(0).normal(size=(4, 20, 3))
+        >>> data = zoo.Sequences.from_arrays(x, rate=30.0)
+        >>> run = zoo.fit(zoo.create("pca", data, latent_dim=2), data)
+        >>> mean, std = run.encode(data)
+        >>> mean.shape, std.shape
+        (torch.Size([4, 20, 2]), torch.Size([4, 20, 2]))
+        >>> run.decode(mean)
+        Prediction of reconstruct: sequence 4, time 20, channel 3; in no unit, with spread
+        """
+        self._need("represent")
+        whole_number(draws, "draws")
+        model: Any = self.model
+        ask = model.encode if isinstance(model, Encodes) else model.represent
+        found, frames = self.exchange.answer(
+            data, lambda batch, posterior, rows: ask(batch, posterior, draws=draws), seed
+        )
+        latent = _latent(found, data.rate, frames)
+        std = latent.std if latent.has_spread else torch.zeros_like(latent.mean)
+        return latent.mean, std
+
+    def decode(self, latent: ArrayLike | Tensor) -> Prediction:
+        """What the model observes at latent points, (sequence, time, latent), in the data's units.
+
+        Each frame is decoded by itself; what the model knows of time does not enter. Raises
+        NotCapableError where the model has no latent coordinates.
+        """
+        model = self.model
+        if not isinstance(model, Decodes):
+            raise NotCapableError(f"{self.name} cannot decode: it has no latent coordinates")
+        z = torch.as_tensor(latent).to(device=self.assembly.device, dtype=self.assembly.dtype)
+        if z.ndim != 3 or z.shape[-1] != model.latent_dim or not bool(z.isfinite().all()):
+            raise ValueError(
+                f"finite latent points (sequence, time, {model.latent_dim}) are needed; got "
+                f"shape {tuple(z.shape)}"
+            )
+        with torch.no_grad():
+            found = model.decode(z[None])
+        return self._frames(self.exchange.unscaled(found, "decode"), "reconstruct")
+
+    def _frames(
+        self, found: Predictive, task: Task, *, offset: int = 0, lengths: Tensor | None = None
+    ) -> Prediction:
+        layout = self.assembly.layout
+        return Prediction(
+            predictive=found,
+            axes=("sequence", "time", "channel"),
+            names=layout.channels,
+            units=layout.units,
+            task=task,
+            rate=layout.rate,
+            offset=offset,
+            lengths=lengths,
         )
 
     def report(self) -> dict[str, Any]:
@@ -111,7 +176,7 @@ class Run(Record, Answers):
     def _keep(self, calibration: Calibration) -> None:
         self.calibration = calibration
 
-    def _method(self, query: Query) -> Answer:
+    def _method(self, query: Query) -> Ask:
         """The model's method for the task, as it is asked about a batch."""
         method: Callable[..., Predictive] = getattr(self.model, query.task)
         draws = query.draws
@@ -154,6 +219,20 @@ class Run(Record, Answers):
         )
 
 
+def _latent(found: Predictive, rate: float, lengths: Tensor) -> Prediction:
+    """Latent coordinates, which have numbers for names and no unit."""
+    count = found.location.shape[-1]
+    return Prediction(
+        predictive=found,
+        axes=("sequence", "time", "latent"),
+        names=tuple(f"z_{i + 1}" for i in range(count)),
+        units=("",) * count,
+        task="represent",
+        rate=rate,
+        lengths=lengths,
+    )
+
+
 def evaluate(
     run: Trained,
     data: Pairs | Sequences,
@@ -161,7 +240,7 @@ def evaluate(
     tasks: Sequence[str] | None = None,
     setup: Setup | None = None,
 ) -> Table:
-    """Score every task that the model can do, or those named, on data it never saw.
+    """Score every task that the model can do, or those named, on held-out data.
 
     A task without an answer on these data is a line that says why; the others are scored.
     """

@@ -16,7 +16,7 @@ __all__ = ["Learned", "learn"]
 
 @dataclass(frozen=True, kw_only=True)
 class Learned:
-    """A trained copy of an assembly, the scaling of its data and a row an epoch or iteration."""
+    """A trained copy of an assembly, the scaling of its data and a row per epoch or iteration."""
 
     assembly: Assembly
     scaler: Scaler

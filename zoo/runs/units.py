@@ -25,10 +25,10 @@ from zoo.runs.assembly import Assembly
 from zoo.streams import seeded
 from zoo.types import Batch, Posterior
 
-__all__ = ["Answer", "Exchange", "check_unseen", "fingerprints"]
+__all__ = ["Ask", "Exchange", "check_unseen", "fingerprints"]
 
 FAR = 0.1
-Answer = Callable[[Batch, Posterior | None, list[int]], Predictive]
+Ask = Callable[[Batch, Posterior | None, list[int]], Predictive]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +67,10 @@ class Exchange:
         scaled: Sequences = self.scaled(data)
         return scaled
 
-    def answer(self, data: Sequences, answer: Answer, seed: int) -> tuple[Predictive, Tensor]:
+    def answer(self, data: Sequences, ask: Ask, seed: int) -> tuple[Predictive, Tensor]:
         """Ask about movements of one length at a time, on a random stream of its own.
 
-        ``answer`` is told which rows of ``data`` its batch holds; beside the answers stands how
+        ``ask`` is told which rows of ``data`` its batch holds; beside the answers stands how
         many frames each movement got.
         """
         scaled = self.movements(data)
@@ -82,7 +82,7 @@ class Exchange:
             for length in sorted(set(lengths)):
                 rows = [i for i, n in enumerate(lengths) if n == length]
                 some = scaled if len(rows) == len(scaled) else scaled[rows]
-                parts.append((rows, answer(whole(some), posterior, rows)))
+                parts.append((rows, ask(whole(some), posterior, rows)))
                 frames[rows] = parts[-1][1].location.shape[2]
         return parts[0][1] if len(parts) == 1 else _merge(parts), frames
 
@@ -189,8 +189,8 @@ def _check_begin(assembly: Assembly, data: Sequences) -> None:
     if not layout.windows and begins - {0}:
         warnings.warn(
             f"{name} was trained on whole movements and takes the first frame of each window for "
-            f"the begin of one; these begin at frame {min(begins - {0})} and later: train it on "
-            "windows too, or give movements from their first frame on",
+            f"the beginning of one; these begin at frame {min(begins - {0})} and later: train it "
+            "on windows too, or give movements from their first frame on",
             WindowsWarning,
             stacklevel=7,
         )
@@ -221,7 +221,7 @@ def check_unseen(
     if again:
         warnings.warn(
             f"{again} of {len(data)} movements or items given for {purpose} were {used} "
-            "(these or equal ones); spreads on them look better than they are",
+            "(these or equal ones); bands on them look better than they are",
             stacklevel=3,
         )
 

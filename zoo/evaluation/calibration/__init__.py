@@ -1,1 +1,1 @@
-"""Recalibration of bands on groups that the model never saw."""
+"""Recalibration of bands on held-out groups."""

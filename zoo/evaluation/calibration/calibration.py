@@ -12,7 +12,7 @@ from torch import Tensor
 from zoo.errors import OtherPeopleWarning, OtherQuestionWarning
 from zoo.evaluation.answers import Groups
 from zoo.evaluation.calibration.asked import Asked
-from zoo.evaluation.calibration.promise import LEVEL, promised
+from zoo.evaluation.calibration.promise import LEVEL, caller, promised
 from zoo.evaluation.calibration.recalibration import Stored, recalibration_from_state
 
 __all__ = ["PEOPLE", "Calibrated", "Calibration"]
@@ -139,7 +139,7 @@ class Calibration:
                 f"promised for them; calibrated for: {known}. run.calibrate(data, "
                 "setup=zoo.Setup(...)) calibrates for this one; prediction.raw has the raw bands",
                 OtherQuestionWarning,
-                stacklevel=4,
+                stacklevel=caller(),
             )
         if people := near.strangers(groups):
             follow = (
@@ -152,7 +152,7 @@ class Calibration:
                 'people who were not in the calibration; run.calibrate(data, by="subject") on '
                 "several people counts people as groups",
                 OtherPeopleWarning,
-                stacklevel=4,
+                stacklevel=caller(),
             )
         return _interpolated(same, asked, near)
 

@@ -17,8 +17,9 @@ from zoo.evaluation.answers import Answer
 from zoo.evaluation.calibration.adapted import difficulty, rehearsal
 from zoo.evaluation.calibration.asked import Asked
 from zoo.evaluation.calibration.calibration import PEOPLE, Calibrated
-from zoo.evaluation.calibration.promise import warn_of_few
-from zoo.evaluation.calibration.recalibration import Conformal, fitted
+from zoo.evaluation.calibration.conformal import Conformal
+from zoo.evaluation.calibration.promise import caller, warn_of_few
+from zoo.evaluation.calibration.recalibration import fitted
 from zoo.evaluation.questions import Question, Setup, ask
 from zoo.evaluation.tasks import Predictor, answered, tasks_of
 from zoo.prediction.prediction import Prediction
@@ -66,7 +67,7 @@ def corrections(
         raise next(iter(refused.values()))
     for task, reason in refused.items():
         told = f"{task} has no answer on the calibration data and stays uncalibrated: {reason}"
-        warnings.warn(told, NotCalibratedWarning, stacklevel=3)
+        warnings.warn(told, NotCalibratedWarning, stacklevel=caller())
     return found
 
 
@@ -169,4 +170,4 @@ def _warn(task: str, found: Sequence[tuple[Calibrated, Answer]]) -> None:
         what = str(part.asked)
         if len(found) > 1:
             what = f"{task} after {int(lengths.min())} to {int(lengths.max())} frames"
-        warn_of_few(answer, correction, correction.worth, correction.reach, what, stacklevel=6)
+        warn_of_few(answer, correction, correction.worth, correction.reach, what)

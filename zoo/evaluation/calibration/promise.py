@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import warnings
 
 from torch import Tensor
@@ -11,7 +12,7 @@ from zoo.errors import FewGroupsWarning
 from zoo.evaluation.answers import Answer
 from zoo.prediction.prediction import Prediction, Recalibration
 
-__all__ = ["promised", "warn_of_few"]
+__all__ = ["caller", "promised", "warn_of_few"]
 
 LEVEL = 0.9
 
@@ -40,7 +41,7 @@ def rank(level: float, groups: int) -> int:
 
 
 def warn_of_few(
-    answer: Answer, found: Recalibration, worth: float, reach: float, what: str, stacklevel: int = 3
+    answer: Answer, found: Recalibration, worth: float, reach: float, what: str
 ) -> None:
     """Warn where the groups cannot promise 90 %, and say what the band rests on instead.
 
@@ -60,8 +61,16 @@ def warn_of_few(
         f"{reach:.0%}, continued like a Gaussian's beyond) and is on average {wider:.2f} times as "
         "wide as the raw one; nothing is promised for it",
         FewGroupsWarning,
-        stacklevel=stacklevel,
+        stacklevel=caller(),
     )
+
+
+def caller() -> int:
+    """The ``stacklevel`` of the line that called the package."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("zoo."):
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def _width(prediction: Prediction, mask: Tensor) -> float:

@@ -1,35 +1,25 @@
-"""Recalibration of predictive spreads on groups that the model never saw.
+"""Recalibration of predictive standard deviations on held-out groups.
 
 What is exchangeable between calibration and use is a whole group (a movement), never a frame. Few
-groups have to do, so the factors of channels and lead times are shrunk (:class:`Factors`), every
+groups have to do, so the factors of channels and lead times are shrunk (:class:`Stretch`), every
 group weighs the same, and scores that set a level come from groups left out of the factors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from statistics import NormalDist
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol
 
-import torch
 from torch import Tensor
 
 from zoo.errors import UnknownNameError
 from zoo.evaluation.answers import Answer, Groups
-from zoo.evaluation.calibration.curve import Curve
-from zoo.evaluation.calibration.factors import By, Factors, crossed, standardised
-from zoo.evaluation.calibration.pool import (
-    LEVELS,
-    Pool,
-    look_up,
-    normal_level,
-    normal_score,
-    scores_of_draws,
-)
+from zoo.evaluation.calibration.conformal import Conformal
+from zoo.evaluation.calibration.isotonic import Isotonic
 from zoo.evaluation.calibration.promise import warn_of_few
+from zoo.evaluation.calibration.scale import Scale
+from zoo.evaluation.calibration.stretch import By
 from zoo.prediction.prediction import Prediction, Recalibration
-from zoo.prediction.predictive import Predictive
 
 __all__ = [
     "RECALIBRATIONS",
@@ -41,232 +31,6 @@ __all__ = [
     "recalibrate",
     "recalibration_from_state",
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scale:
-    """The whole distribution stretched about its mean, σ̃ = σ a b_c d_t; it keeps its density.
-
-    a² b_c² d_t² is the mean of z² = (y − μ)² / σ², which maximises a Gaussian's likelihood, with
-    all groups weighing the same and b, d shrunk. Joint draws keep their dependence.
-    """
-
-    kind: ClassVar[str] = "scale"
-    factors: Factors
-    groups: int
-
-    @classmethod
-    def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
-        """Variance factors from the mean squared standardised residual."""
-        sizes = standardised(answer).square()
-        return cls(factors=Factors.fit(sizes, answer, by, 2), groups=answer.groups)
-
-    def predictive(self, raw: Prediction) -> Predictive:
-        """The stretched mixture."""
-        return raw.predictive.stretched(self.factors.of(raw))
-
-    def quantile(self, raw: Prediction, level: float) -> Tensor:
-        """Quantile of the stretched mixture."""
-        return raw.mean + self.factors.of(raw) * (raw.quantile(level) - raw.mean)
-
-    def cdf(self, raw: Prediction, value: Tensor) -> Tensor:
-        """Distribution function of the stretched mixture."""
-        return raw.cdf(raw.mean + (value - raw.mean) / self.factors.of(raw))
-
-    def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
-        """Draws stretched about the mean."""
-        return raw.mean + self.factors.of(raw) * (draws - raw.mean)
-
-    def rows(self, index: slice | Tensor) -> Self:
-        """The correction of some movements, which is that of all."""
-        return self
-
-    def blend(self, other: Scale, share: float) -> Scale:
-        """Between this correction and another, at a share of the way."""
-        factors = self.factors.blend(other.factors, share)
-        return Scale(factors=factors, groups=min(self.groups, other.groups))
-
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """JSON and tensors to store."""
-        return {"kind": self.kind, "groups": self.groups}, self.factors.state()
-
-    @classmethod
-    def from_state(cls, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """What :meth:`state` gave."""
-        return cls(factors=Factors.from_state(tensors), groups=int(meta["groups"]))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Conformal:
-    r"""Normalised split conformal intervals μ ± q(p) σ b_c d_t.
-
-    The score is \|y − μ\| / (σ b_c d_t), with factors fitted without the score's own group. q(p)
-    is the smallest score that a share p (1 + 1/G_eff) of the scores does not exceed, each group
-    weighing the same. G_eff (``worth``) is what the groups are worth as independent entries
-    (:class:`~zoo.evaluation.calibration.pool.Pool`). Where all entries of a group stand or fall
-    together G_eff = G, the hierarchical conformal quantile with its guarantee for a new group; with
-    one entry a group it is the usual split conformal quantile, (n + 1) p scores out of n. Between
-    the two the guarantee is approximate. ``reach`` is the widest level that the groups support;
-    beyond it q grows like a Gaussian's. The result is symmetric about the mean and has no density.
-    """
-
-    kind: ClassVar[str] = "conformal"
-    factors: Factors
-    thresholds: Curve
-    groups: int
-    worth: float
-    reach: float
-
-    @classmethod
-    def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
-        """Factors from all groups, thresholds from scores of groups left out in turn."""
-        sizes = standardised(answer).abs()
-        scores = sizes / crossed(sizes, answer, by, 1, common=False)
-        pool = Pool.of(scores, answer)
-        corrected = LEVELS * (1 + 1 / pool.independent)
-        supported = corrected <= 1
-        if not bool(supported.any()):
-            raise ValueError(f"{answer.groups} groups are too few for any conformal interval")
-        return cls(
-            factors=Factors.fit(sizes, answer, by, 1, common=False),
-            thresholds=Curve.through(
-                normal_score((1 + LEVELS[supported]) / 2),
-                pool.quantile(corrected[supported]),
-                from_zero=True,
-            ),
-            groups=answer.groups,
-            worth=pool.independent,
-            reach=float(LEVELS[supported][-1]),
-        )
-
-    def predictive(self, raw: Prediction) -> None:
-        """No mixture: only the quantiles are known."""
-
-    def quantile(self, raw: Prediction, level: float) -> Tensor:
-        """Mean plus the threshold of that level times the corrected spread."""
-        score = torch.tensor(NormalDist().inv_cdf(level), dtype=torch.float64)
-        threshold = self.thresholds(score.abs()) * score.sign()
-        return raw.mean + threshold.to(raw.mean) * self._spread(raw)
-
-    def cdf(self, raw: Prediction, value: Tensor) -> Tensor:
-        """Level of the quantile that ``value`` is."""
-        reduced = ((value - raw.mean) / self._spread(raw)).double()
-        score = self.thresholds.inverse(reduced.abs()) * reduced.sign()
-        return normal_level(score).to(value)
-
-    def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
-        """Each draw moved to the corrected quantile of its own raw level."""
-        score = scores_of_draws(raw, draws).double()
-        threshold = (self.thresholds(score.abs()) * score.sign()).to(draws)
-        return raw.mean + threshold * self._spread(raw)
-
-    def rows(self, index: slice | Tensor) -> Self:
-        """The correction of some movements, which is that of all."""
-        return self
-
-    def blend(self, other: Conformal, share: float) -> Conformal:
-        """Between this correction and another, at a share of the way."""
-        return Conformal(
-            factors=self.factors.blend(other.factors, share),
-            thresholds=self.thresholds.blend(other.thresholds, share),
-            groups=min(self.groups, other.groups),
-            worth=min(self.worth, other.worth),
-            reach=min(self.reach, other.reach),
-        )
-
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """JSON and tensors to store."""
-        meta = {"groups": self.groups, "worth": self.worth, "reach": self.reach}
-        return {"kind": self.kind, **meta}, {**self.factors.state(), **self.thresholds.state()}
-
-    @classmethod
-    def from_state(cls, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """What :meth:`state` gave."""
-        return cls(
-            factors=Factors.from_state(tensors),
-            thresholds=Curve.from_state(tensors),
-            groups=int(meta["groups"]),
-            worth=float(meta["worth"]),
-            reach=float(meta["reach"]),
-        )
-
-    def _spread(self, raw: Prediction) -> Tensor:
-        spread = raw.std * self.factors.of(raw)
-        return spread.clamp(min=torch.finfo(spread.dtype).tiny)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Isotonic:
-    """The stretched distribution with its levels mapped to those observed, R(F(y)).
-
-    R is the isotonic map from nominal to observed frequency of the PIT values, kept as a
-    monotone curve between normal scores so that the tails stay usable; skew is corrected too.
-    """
-
-    kind: ClassVar[str] = "isotonic"
-    scale: Scale
-    levels: Curve
-    groups: int
-
-    @classmethod
-    def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
-        """Weighted quantiles of the PIT values' normal scores, on groups left out of the scale."""
-        raw = answer.prediction
-        factors = crossed(standardised(answer).square(), answer, by, 2).to(raw.mean)
-        reduced = raw.mean + (answer.truth - raw.mean) / factors
-        scores = torch.where(answer.mask, raw.normal_score(reduced).double(), 0.0)
-        pool = Pool.of(scores, answer)
-        return cls(
-            scale=Scale.fit(answer, by),
-            levels=Curve.through(normal_score(LEVELS), pool.quantile(LEVELS)),
-            groups=answer.groups,
-        )
-
-    def predictive(self, raw: Prediction) -> None:
-        """No mixture: only the quantiles are known."""
-
-    def quantile(self, raw: Prediction, level: float) -> Tensor:
-        """Quantile of the stretched mixture at the level that comes true that often."""
-        score = torch.tensor(NormalDist().inv_cdf(level), dtype=torch.float64)
-        return self.scale.transport(raw, raw.quantile_at(float(self.levels(score))))
-
-    def cdf(self, raw: Prediction, value: Tensor) -> Tensor:
-        """Observed frequency of the stretched mixture's level."""
-        reduced = raw.mean + (value - raw.mean) / self.scale.factors.of(raw)
-        score = self.levels.inverse(raw.normal_score(reduced).double())
-        return normal_level(score).to(value)
-
-    def transport(self, raw: Prediction, draws: Tensor) -> Tensor:
-        """Each draw moved to the corrected quantile of its own raw level."""
-        score = self.levels(scores_of_draws(raw, draws).double()).to(draws)
-        knots = torch.stack([raw.quantile_at(s / 2) for s in range(-8, 9)])
-        return self.scale.transport(raw, look_up(knots, 2 * score + 8))
-
-    def rows(self, index: slice | Tensor) -> Self:
-        """The correction of some movements, which is that of all."""
-        return self
-
-    def blend(self, other: Isotonic, share: float) -> Isotonic:
-        """Between this correction and another, at a share of the way."""
-        return Isotonic(
-            scale=self.scale.blend(other.scale, share),
-            levels=self.levels.blend(other.levels, share),
-            groups=min(self.groups, other.groups),
-        )
-
-    def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """JSON and tensors to store."""
-        meta, tensors = self.scale.state()
-        return {**meta, "kind": self.kind}, {**tensors, **self.levels.state()}
-
-    @classmethod
-    def from_state(cls, meta: Mapping[str, Any], tensors: dict[str, Tensor]) -> Self:
-        """What :meth:`state` gave."""
-        return cls(
-            scale=Scale.from_state(meta, tensors),
-            levels=Curve.from_state(tensors),
-            groups=int(meta["groups"]),
-        )
 
 
 class Stored(Recalibration, Protocol):
@@ -306,7 +70,7 @@ def recalibrate(
     *,
     by: tuple[By, ...] = ("channel", "time"),
 ) -> Stored:
-    """A correction of ``prediction``'s spread, to be used on predictions of the same kind.
+    """A correction of ``prediction``'s bands, to be used on predictions of the same kind.
 
     ``kind`` is ``conformal``, ``isotonic`` or ``scale``; ``by`` says which factors are fitted
     beside the common one. Groups are those of :func:`~zoo.evaluation.answers.clusters`. Of too few
@@ -315,6 +79,7 @@ def recalibrate(
     says what they can promise and what the bands became.
 
     >>> import torch
+    >>> from zoo.prediction.predictive import Predictive
     >>> raw = Prediction(
     ...     predictive=Predictive(location=torch.zeros(1, 400, 1), noise=torch.ones(1)),
     ...     axes=("item", "target"), names=("f_z",), units=("N",), task="regress")

@@ -1,4 +1,4 @@
-"""Figures of predictions: reliability, PIT histogram, forecast bands, spread over the lead time.
+"""Figures of predictions: reliability, PIT histogram, forecast bands, error over the lead time.
 
 Every function gives a ``matplotlib.figure.Figure`` to save or show; nothing global is touched.
 """
@@ -117,20 +117,25 @@ def spread_over_time(
     mask: Tensor | None = None,
     groups: Groups | None = None,
 ) -> Figure:
-    """Predicted spread beside the actual error over the lead time, root mean squares.
+    """Predicted standard deviation beside the actual error over the lead time, root mean squares.
 
-    Where the model splits its spread, the part of the observation noise is drawn as well. Units
+    Where the model splits its variance, the part of the observation noise is drawn as well. Units
     must agree over the channels.
     """
     if len(set(prediction.units)) > 1:
-        raise ValueError("channels have several units; a common spread needs one")
+        raise ValueError("channels have several units; a common standard deviation needs one")
     answer = Answer.of(prediction, truth, mask, groups)
     figure = _figure(5.6, 3.4)
     axes = figure.subplots()
     time = _time(prediction)
     error = answer.truth - prediction.mean.double()
     axes.plot(time, _root_mean(error, answer), color="black", label="actual error")
-    axes.plot(time, _root_mean(prediction.std, answer), color=COLOURS[0], label="predicted spread")
+    axes.plot(
+        time,
+        _root_mean(prediction.std, answer),
+        color=COLOURS[0],
+        label="predicted standard deviation",
+    )
     if prediction.effective is not None:
         noise = _root_mean(prediction.aleatoric, answer)
         axes.plot(time, noise, color=COLOURS[0], linestyle=":", label="of which noise")
@@ -188,7 +193,7 @@ def _bands(
         path = whole[:, index].tolist()
         axes.plot(when, path, color="black", linewidth=1.1, linestyle="--", label="truth")
         if frames:
-            axes.plot(when[:start], path[:start], color="black", linewidth=2, label="seen")
+            axes.plot(when[:start], path[:start], color="black", linewidth=2, label="observed")
             axes.axvline(start / rate, color=_GREY, linewidth=0.8, linestyle=":")
     axes.set_title(prediction.names[index], fontsize=10, loc="left")
     axes.set_ylabel(prediction.units[index] or "value")

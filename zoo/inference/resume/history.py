@@ -1,4 +1,4 @@
-"""What a training reports: a row an epoch, kept as JSON lines and, on request, for TensorBoard."""
+"""What a training reports: a row per epoch, kept as JSON lines and, on request, for TensorBoard."""
 
 from __future__ import annotations
 

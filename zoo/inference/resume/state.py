@@ -83,7 +83,7 @@ class Parts:
 
 @dataclass
 class State:
-    """Place, best state, and the last good state: an epoch's start whose first step was finite."""
+    """Place, best state, and the last good state, at the start of an epoch with a finite step."""
 
     good: Tensors
     place: Place = field(default_factory=Place)

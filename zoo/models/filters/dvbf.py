@@ -122,7 +122,7 @@ class Dvbf(nn.Module):
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Movements through the transition, with the recognised noise."""
-        return self._decoded(self._paths(batch, posterior, 0, draws))
+        return self.decode(self._paths(batch, posterior, 0, draws))
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -137,7 +137,7 @@ class Dvbf(nn.Module):
                 f"the forecast diverges within {horizon} frames: the roll-out left what was "
                 "trained on; try a shorter horizon, longer windows or longer training"
             )
-        return self._decoded(paths[:, :, batch.values.shape[1] :])
+        return self.decode(paths[:, :, batch.values.shape[1] :])
 
     def _paths(
         self, batch: Batch, posterior: Posterior | None, horizon: int, draws: int
@@ -152,5 +152,6 @@ class Dvbf(nn.Module):
         paths: Tensor = self.path(noise, every).unflatten(0, (draws, len(batch)))
         return paths
 
-    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+    def decode(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z_t)."""
         return Predictive(location=self.decoder(paths), noise=self.output_std, joint=True)

@@ -36,10 +36,10 @@ class Config:
     """``latent_dim`` d', ``hidden`` decoder units of ``activation``, ``kernels``, α (β = α/4).
 
     None for α is 25 a movement, or 0.4 a frame for movements under 64 frames, whose Euler steps
-    would else be unstable. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
+    are unstable otherwise. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
     w and ż_1, in units of the acceleration αβ and of the movement's length; ``noise_scale`` is
     where w_ε starts, in the same unit as w, and stays where ``fixed_noise``; ``output_std`` where
-    the constant output spread starts, in scaled units, never below ``output_floor``.
+    the constant output standard deviation starts, in scaled units, never below ``output_floor``.
 
     ``goal_scaling`` multiplies the forcing term by z^goal − z_0, the first frame, as §6.3.2 does:
     w then says how a movement goes to its goal, wherever that is. ``common_forcing`` is the

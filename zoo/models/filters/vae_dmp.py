@@ -92,7 +92,7 @@ class VaeDmp(LatentPathPrior):
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Whole movements through the DMP with the recognised w, goal, start and noise."""
-        return self._decoded(self._posterior_paths(batch, posterior, draws))
+        return self.decode(self._posterior_paths(batch, posterior, draws))
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -100,12 +100,12 @@ class VaeDmp(LatentPathPrior):
         """Joint draws of the future, given the encoded frames seen; phase 0 is the first frame."""
         seen = batch.values.shape[1]
         paths = self._conditioned(batch, need(posterior), seen + horizon).sample(draws)
-        return self._decoded(paths[:, :, seen:])
+        return self.decode(paths[:, :, seen:])
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Joint draws of whole movements given the entries seen."""
         paths = self._conditioned(batch, need(posterior), batch.values.shape[1]).sample(draws)
-        return self._decoded(paths)
+        return self.decode(paths)
 
     def generate(
         self,
@@ -132,7 +132,7 @@ class VaeDmp(LatentPathPrior):
         response = Response.of(system, pull.shape[-2] + 1, pull.dtype, pull.device)
         rest = torch.zeros_like(position)
         force = system.stiffness * (pull + noise)
-        return self._decoded(response.states(position, velocity / duration, rest, force)[0])
+        return self.decode(response.states(position, velocity / duration, rest, force)[0])
 
     def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
         """σ of movements that no network was trained on, never below what training found.
@@ -190,6 +190,7 @@ class VaeDmp(LatentPathPrior):
         check_whole(self.label, self.frames, batch.values.shape[1])
         return self._paths(need(posterior).draw(batch, draws), batch, draws)
 
-    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+    def decode(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z*_t)."""
         location = self.decoder(paths.to(self.output_root))
         return Predictive(location=location, noise=self.output_std, joint=True)

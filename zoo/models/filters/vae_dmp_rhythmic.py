@@ -181,7 +181,7 @@ class RhythmicVaeDmp(VaeDmp):
     def _cycles(
         self, timings: Float[Tensor, "timing 2"], length: int
     ) -> Float[Tensor, "timing frame row"]:
-        """Φ: answers to each kernel's force and to the goal, long after the begin."""
+        """Φ: answers to each kernel's force and to the goal, long after the beginning."""
         before = math.ceil(SETTLING * (self.frames - 1) / self.system.alpha)
         Ψ = self.rhythm(timings[:, 0], timings[:, 1], length - 1, before=before)
         force = nn.functional.pad(self.config.w_scale * Ψ, (0, 1), value=1.0).movedim(1, 0)

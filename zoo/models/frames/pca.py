@@ -25,7 +25,8 @@ class Config:
     """Settings of :class:`PCA`.
 
     ``noise_floor`` is the least σ in scaled units, for data of lower rank than they have channels;
-    ``em_iterations`` and ``em_tolerance`` (nats a seen entry) end EM where entries are missing.
+    ``em_iterations`` and ``em_tolerance`` (nats per observed entry) end EM where entries
+    are missing.
     """
 
     latent_dim: Count = 5
@@ -126,6 +127,11 @@ class PCA(nn.Module):
             epistemic=spread.sqrt()[None],
             draws=z @ f.loading.T + f.mean,
         )
+
+    def decode(self, z: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z_t)."""
+        f = self.factors()
+        return Predictive(location=z @ f.loading.T + f.mean, noise=f.noise, joint=True)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(x_missing | x_seen), the exact Gaussian conditional; seen entries reconstructed."""

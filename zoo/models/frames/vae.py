@@ -105,6 +105,10 @@ class VAE(nn.Module):
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(x̂_t | x_t) of a second observation of the same frame: a mixture over draws of z."""
         z, _ = self._latents(batch, posterior, draws)
+        return self.decode(z)
+
+    def decode(self, z: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z_t)."""
         mean, std = self.decoder(z)
         return Predictive(location=mean, noise=std, joint=True)
 

@@ -126,7 +126,11 @@ class VAEDynamics(nn.Module):
         actions = self._actions(batch, frames - 1)
         if actions is not None:
             actions = nn.functional.pad(actions, (0, 0, 1, 0))
-        mean, std = self.decoder(self.step(before, actions))
+        return self.decode(self.step(before, actions))
+
+    def decode(self, z: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z̃_t), of coordinates after the transition."""
+        mean, std = self.decoder(z)
         return Predictive(location=mean, noise=std, joint=True)
 
     def forecast(

@@ -159,15 +159,15 @@ class AeDmp(nn.Module):
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The movements rolled out by the DMP and decoded, p(x̂ | θ)."""
-        return self._decoded(self.imitator.roll_out(self._imitated(batch, posterior))[None])
+        return self.decode(self.imitator.roll_out(self._imitated(batch, posterior))[None])
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Missing joints by the chain of §5.3.4 and a DMP; missing frames given those seen."""
         y, seen = self._encoded(batch, posterior)
         if bool(seen.all()):
-            return self._decoded(self._smoothed(y, batch.mask)[None])
+            return self.decode(self._smoothed(y, batch.mask)[None])
         paths = self._completed(y, seen, y.shape[1], draws)
-        return self._decoded(torch.where(seen[..., None], y, paths))
+        return self.decode(torch.where(seen[..., None], y, paths))
 
     def _smoothed(
         self,
@@ -186,7 +186,7 @@ class AeDmp(nn.Module):
         """Roll-outs given the encoded frames seen; phase 0 is the first frame."""
         y, seen = self._encoded(batch, posterior)
         known = y.shape[1]
-        return self._decoded(self._completed(y, seen, known + horizon, draws)[:, :, known:])
+        return self.decode(self._completed(y, seen, known + horizon, draws)[:, :, known:])
 
     def generate(
         self,
@@ -202,12 +202,12 @@ class AeDmp(nn.Module):
         if wishes.goal is not None:
             θ = self.imitator.aimed(θ, need(posterior).encode(wishes.goal).mean)
         if wishes.onto is None:
-            return self._decoded((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
+            return self.decode((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
         η = ramp(length, wishes.start, wishes.steps)
         here = self.imitator.design(length, duration=duration, weight=1 - η)
         there = self.imitator.design(length, duration=duration, weight=η, begin=False)
         path = here.to(θ) @ θ + there.to(θ) @ self._imitated(wishes.onto, posterior)
-        return self._decoded(path[None])
+        return self.decode(path[None])
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
         """Keep the θ of the training movements and what their roll-outs leave of the paths."""
@@ -278,7 +278,12 @@ class AeDmp(nn.Module):
         check_whole(self.label, self.frames, batch.values.shape[1])
         return batch.values
 
-    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+    def encode(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """y_t = enc(x_t) of every frame, before the DMP; missing entries count as 0."""
+        return Predictive(location=need(posterior).encode(batch.values, batch.mask).mean[None])
+
+    def decode(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | y_t), independent of the frames beside."""
         return Predictive(location=self.decoder(paths), noise=self.σ, joint=True)
 
 

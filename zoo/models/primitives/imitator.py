@@ -29,7 +29,7 @@ class Imitator:
 
     θ is in units of the prior N(0, I): latent positions for y₁ and g, 10 movement lengths for ẏ₁,
     and 3 for w, whose forces are in units of αβ. None for α is 25 a movement, or 0.4 a frame for
-    movements under 64 frames, whose Euler steps would else be unstable.
+    movements under 64 frames, whose Euler steps are unstable otherwise.
 
     >>> imitator = Imitator(frames=70, kernels=20)
     >>> path = torch.linspace(0, 1, 70)[:, None].sin()

@@ -93,6 +93,7 @@ class PcaDmp(nn.Module):
         """Both parts without data."""
         super().__init__()
         self.layout, self.config = layout, config
+        self.latent_dim = config.latent_dim
         names = tuple(f"z_{i + 1}" for i in range(config.latent_dim))
         latent = replace(layout, channels=names, units=("",) * len(names))
         self.pca = pca.PCA(layout, config.pca)
@@ -159,6 +160,10 @@ class PcaDmp(nn.Module):
         seen = seen_entries(batch)
         parts = self._shown(batch.values, seen, _whole(seen), 1, fresh=True)
         return _predictive(parts, self.pca.noise, draws)
+
+    def decode(self, z: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z_t), of the components alone."""
+        return self.pca.decode(z)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The paths given the entries seen."""

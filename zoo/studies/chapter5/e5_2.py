@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
@@ -61,9 +59,7 @@ def _without(data: Sequences, label: str, quick: bool, progress: bool) -> Run:
 
 def _latent(run: Run, data: Sequences) -> tuple[Column, Column]:
     """Encoded path and its roll-out by the DMP, (time, latent)."""
-    guide: Any = run.assembly.guide
-    with torch.no_grad():
-        encoded: Tensor = guide.encode(run.exchange.scaled(data).values.float()).mean
+    encoded, _ = run.encode(data)
     rolled = run.represent(data, draws=1).mean
     return encoded[0].double().numpy(), rolled[0].double().numpy()
 

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from zoo.datasets.records import Sequences
 from zoo.evaluation.figures.postures import posture_strips
-from zoo.prediction.predictive import Predictive
 from zoo.runs.run import Run
 from zoo.studies.chapter5.walking import both, fitted
 from zoo.studies.result import Result
@@ -52,11 +51,7 @@ def _switched(walks: Tensor, jogs: Tensor, unit: int) -> Tensor:
 
 
 def _decoded(model: Run, latent: Tensor) -> Tensor:
-    decoder: Any = model.model.decoder
-    with torch.no_grad():
-        angles = decoder(latent.float())
-    found = model.exchange.unscaled(Predictive(location=angles[None]), "generate")
-    return found.location[0].double()
+    return model.decode(latent).mean.double()
 
 
 def _tempo(angles: Tensor, hip: int, rate: float) -> float:

@@ -92,7 +92,7 @@ def _result(errors: Errors, seconds: dict[str, float]) -> Result:
                 for name in ("ae-dmp", "vae-dmp", "promp")
                 for part in ("trained on", "held out")
             ),
-            _sceptical(errors),
+            _beside_the_mean(errors),
             "ae-dmp fills by the chain of §5.3.4, k = 4, from the training mean, and decodes the "
             "primitive nearest to the latent path found, where the thesis leaves the DMP out; "
             "inputs are corrupted four neighbours at a time. The others condition on the joints "
@@ -125,7 +125,7 @@ def _compared(name: str, part: str, errors: Errors) -> str:
     )
 
 
-def _sceptical(errors: Errors) -> str:
+def _beside_the_mean(errors: Errors) -> str:
     means = {name: errors[name, "held out"][0].mean() / UNIT for name in MODELS}
     order = sorted(means, key=lambda name: means[name])
     ranked = ", ".join(f"{name} {means[name]:.2f}" for name in order)

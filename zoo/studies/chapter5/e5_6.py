@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,12 +99,16 @@ def _rms(apart: Tensor) -> float:
     return float(apart.square().mean().sqrt())
 
 
-def _latent(run: Run, angles: Tensor) -> Tensor:
-    guide: Any = run.assembly.guide
-    shift, scale = run.scaler.channel_shift, run.scaler.channel_scale
-    with torch.no_grad():
-        found: Tensor = guide.encode(((angles - shift) / scale).float()).mean
-    return found
+def _latent(run: Run, punch: Sequences, angles: Tensor) -> Tensor:
+    """Codes of frames that are like those of ``punch``, (time, latent)."""
+    frames = angles.view(1, -1, angles.shape[-1])
+    given = replace(
+        punch[:1],
+        values=frames,
+        mask=torch.ones_like(frames, dtype=torch.bool),
+        lengths=torch.tensor([frames.shape[1]]),
+    )
+    return run.encode(given)[0][0]
 
 
 def _figure(
@@ -126,11 +131,12 @@ def _plane(
     axes: Axes, run: Run, punch: Sequences, goals: list[Tensor], found: list[Prediction]
 ) -> None:
     """Encoded paths in the two neurons of the largest variance."""
-    paths = [_latent(run, p.mean[0].double()) for p in found]
-    wide = _latent(run, punch.values[0].double()).var(0).argsort(descending=True)[:2].tolist()
+    paths = [_latent(run, punch, p.mean[0].double()) for p in found]
+    own = _latent(run, punch, punch.values[0].double())
+    wide = own.var(0).argsort(descending=True)[:2].tolist()
     for share, goal, path in zip(SHARES, goals, paths, strict=True):
         (line,) = axes.plot(path[:, wide[0]], path[:, wide[1]], label=f"{share:.0%}")
-        end = _latent(run, goal)
+        end = _latent(run, punch, goal)[0]
         axes.plot(end[wide[0]], end[wide[1]], "x", color=line.get_color())
     axes.plot(*paths[0][0, wide], "o", color="black")
     axes.legend(title="goal (x)", fontsize=8, frameon=False)

@@ -13,7 +13,6 @@ from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.evaluation.figures.postures import posture_map
 from zoo.nn.metric import sensitivity
-from zoo.prediction.predictive import Predictive
 from zoo.runs.run import Run, create
 from zoo.studies.kept import trained
 from zoo.studies.result import Result
@@ -73,10 +72,7 @@ def box(latents: Tensor, points: int) -> Tensor:
 
 def decoded(run: Run, z: Tensor) -> Tensor:
     """Joint angles in rad of latent points."""
-    decoder: Any = run.model.decoder
-    with torch.no_grad():
-        angles = decoder(z.float())
-    return run.exchange.unscaled(Predictive(location=angles[None]), "reconstruct").location[0]
+    return run.decode(z).mean
 
 
 def _mapped(run: Run, data: Sequences) -> tuple[Tensor, Tensor, Tensor]:
@@ -88,13 +84,12 @@ def _mapped(run: Run, data: Sequences) -> tuple[Tensor, Tensor, Tensor]:
 
 def _decoder(run: Run) -> Callable[[Tensor], Tensor]:
     """The mean of the decoder in rad, up to a constant, of models with a spread as well."""
-    decoder: Any = run.model.decoder
+    model: Any = run.model
     scale = run.scaler.channel_scale.float()
 
     def mean(z: Tensor) -> Tensor:
-        found = decoder(z)
-        angles: Tensor = found[0] if isinstance(found, tuple) else found
-        return angles * scale
+        angles: Tensor = model.decode(z).location * scale
+        return angles
 
     return mean
 

@@ -1,4 +1,4 @@
-"""Factors by which a spread is off, per channel and lead time, shrunk to what the groups tell."""
+"""Factors that correct a standard deviation, per channel and lead time, shrunk by the groups."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from zoo.evaluation.answers import Answer, group_sums
 from zoo.evaluation.calibration.curve import interpolate
 from zoo.prediction.prediction import Prediction
 
-__all__ = ["By", "Factors", "crossed", "standardised"]
+__all__ = ["By", "Stretch", "crossed", "standardised"]
 
 By = Literal["channel", "time"]
 _FOLDS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Factors:
+class Stretch:
     r"""σ̃_{t,c} = σ_{t,c} · a · b_c · d_t.
 
     b and d come from group means of the standardised residuals and are shrunk to 1 by empirical
@@ -78,13 +78,13 @@ class Factors:
             factor = factor * self.time[lead, None]
         return factor.to(raw.predictive.location)
 
-    def blend(self, other: Factors, share: float) -> Factors:
+    def blend(self, other: Stretch, share: float) -> Stretch:
         """Geometric means with another's; the shorter one's last lead time goes on."""
         frames = max(len(self.time), len(other.time))
         times = [f.time[torch.arange(frames).clamp(max=len(f.time) - 1)] for f in (self, other)]
         pairs = {"level": (self.level, other.level), "channel": (self.channel, other.channel)}
         found = {k: a ** (1 - share) * b**share for k, (a, b) in pairs.items()}
-        return Factors(**found, time=times[0] ** (1 - share) * times[1] ** share)
+        return Stretch(**found, time=times[0] ** (1 - share) * times[1] ** share)
 
     def state(self) -> dict[str, Tensor]:
         """Its tensors."""
@@ -102,7 +102,7 @@ def standardised(answer: Answer) -> Float[Tensor, "sequence *rest"]:
     std = raw.std.double()
     if bool((std[answer.mask] <= 0).any()):
         count = int((std[answer.mask] <= 0).sum())
-        raise ValueError(f"{count} known entries are predicted with a spread of 0")
+        raise ValueError(f"{count} known entries are predicted with a standard deviation of 0")
     z = (answer.truth.double() - raw.mean.double()) / std
     return torch.where(answer.mask, z, 0.0)
 
@@ -122,7 +122,7 @@ def crossed(
             cluster=answer.cluster,
         )
         if bool(held.any()) and bool(rest.mask.any()):
-            out[held] = Factors.fit(sizes, rest, by, power, common).of(answer.prediction).to(out)
+            out[held] = Stretch.fit(sizes, rest, by, power, common).of(answer.prediction).to(out)
     return out
 
 
