@@ -30,8 +30,8 @@ from zoo.movement.forcing import (
 )
 from zoo.movement.kalman import PathNoise
 from zoo.movement.response import Response, Transformation, discrete_basis, phase
-from zoo.movement.rollout import Timing, roll_out
-from zoo.movement.timing import period_of
+from zoo.movement.rollout import roll_out
+from zoo.movement.timing import Timing, period_of
 from zoo.prediction import mixtures
 from zoo.streams import seeded
 from zoo.types import Wishes
@@ -253,7 +253,7 @@ def test_guide_is_the_posterior_of_the_program_at_every_draw(make, information):
     seen = torch.rand(batch.values.shape, generator=torch.Generator().manual_seed(1)) < 0.8
     batch = replace(batch, movements=batch.movements * seen, movement_mask=seen)
     guide = ExactPosterior(data.layout, model, ExactConfig())
-    timings = model._whole(batch.movements.shape[1])
+    timings = model.expected.whole(batch.movements.shape[1])
     pairs = zip(batch.movements, seen, strict=True)
     expected = sum(evidence(model, timings, x, s) for x, s in pairs)
     for seed in range(4):

@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
+from zoo.models.primitives.alignment import anchors
 from zoo.movement.conjugate_regression import conjugate_weights
-from zoo.movement.rollout import Primitive, Timing
-from zoo.movement.timing import anchors
+from zoo.movement.rollout import Primitive
+from zoo.movement.timing import Timing
 
 
 @pytest.mark.parametrize("kind", ["discrete", "rhythmic"])

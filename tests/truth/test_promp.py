@@ -16,7 +16,7 @@ from zoo.inference.loader import whole
 from zoo.models.primitives.promp import Config, ProMP
 from zoo.models.primitives.weight_learning import Noise, Single, learn, similarity, views_of
 from zoo.models.primitives.weights import Basis, Weights
-from zoo.movement.rollout import Timing
+from zoo.movement.timing import Timing
 from zoo.streams import seeded
 from zoo.types import Wishes
 

@@ -21,7 +21,7 @@ from zoo.models.primitives.cross_fitting import choose
 from zoo.models.primitives.preparation import Preparation
 from zoo.models.primitives.promp import Config, ProMP
 from zoo.models.primitives.scales import student_scales
-from zoo.movement.rollout import Timing
+from zoo.movement.timing import Timing
 from zoo.prediction.mixtures import cdf
 from zoo.streams import seeded
 from zoo.types import Wishes

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -20,23 +19,16 @@ from torch import Tensor
 
 from zoo.movement.forcing import trajectory_matrix
 from zoo.movement.response import Response, Transformation, discrete_basis, phase, rhythmic_basis
+from zoo.movement.timing import Kind, Timing
 
-__all__ = ["Primitive", "Timing", "roll_out"]
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Frames in a movement's unit of time (its duration or its period) and the phase at frame 0."""
-
-    unit: float
-    offset: float = 0.0
+__all__ = ["Primitive", "roll_out"]
 
 
 @dataclass(frozen=True)
 class Primitive:
     """Constants of a movement primitive whose unit of time is its duration or its period."""
 
-    kind: Literal["discrete", "rhythmic"]
+    kind: Kind
     kernels: int
     alpha: float
     beta: float

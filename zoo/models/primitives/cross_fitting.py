@@ -13,8 +13,7 @@ from torch.distributions import StudentT
 from zoo.models.primitives.alignment import BasisOf
 from zoo.models.primitives.weight_learning import Noise, Single, View
 from zoo.models.primitives.weights import Basis, Weights
-from zoo.movement.rollout import Timing
-from zoo.movement.sufficient_statistics import Movements
+from zoo.movement.timing import Expected, Movements
 
 __all__ = ["Choice", "Prepared", "choose", "inflation"]
 
@@ -44,7 +43,7 @@ class Prepared:
     offset: Float[Tensor, " channel"]
     views: list[View]
     single: Single
-    expected: list[Timing]
+    expected: Expected
 
     def centred(self, values: Tensor, seen: Tensor) -> Tensor:
         """Values about the offset, 0 where nothing was observed."""
@@ -116,7 +115,7 @@ def _left(prepared: Prepared, values: Tensor, seen: Tensor) -> _Left:
     early = torch.arange(frames)[:, None] < begin
     x = prepared.centred(values, seen)
     template = prepared.single.weights.mean.mean(0)
-    bases = [prepared.basis(frames, timing) for timing in prepared.expected]
+    bases = [prepared.basis(frames, timing) for timing in prepared.expected.timings]
     paths = torch.stack([Basis(b.phases[:begin], b.synergies).path(template) for b in bases])
     error = ((x[:begin] - paths) * seen[:begin]).square().sum((1, 2))
     near = error.topk(min(CANDIDATES, len(bases)), largest=False).indices.tolist()

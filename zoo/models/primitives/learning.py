@@ -10,14 +10,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from zoo.models.primitives.alignment import anchors_of, primitive_timings
 from zoo.models.primitives.communality import blocks, unshared
 from zoo.models.primitives.population import Population, Shares, estimate
 from zoo.models.primitives.scales import student_scales
 from zoo.movement.conjugate_regression import FLOOR, conjugate_weights
 from zoo.movement.forcing import locally_weighted_regression, target_force
-from zoo.movement.rollout import Primitive, Timing, roll_out
-from zoo.movement.sufficient_statistics import Movements, Sums, of_weights, square_after, sums_of
-from zoo.movement.timing import anchors, timings_of
+from zoo.movement.rollout import Primitive, roll_out
+from zoo.movement.sufficient_statistics import Sums, of_weights, square_after, sums_of
+from zoo.movement.timing import Movements, Timing
 
 __all__ = ["Learned", "Learning", "learn"]
 
@@ -74,10 +75,8 @@ def learn(
     movements = [
         (x[:n], seen[:n]) for x, seen, n in zip(values, mask, lengths.tolist(), strict=True)
     ]
-    timings = timings_of(primitive, movements, period)
-    starts = torch.stack(
-        [anchors(primitive, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)]
-    )
+    timings = primitive_timings(primitive, movements, period)
+    starts = anchors_of(primitive, movements, timings)
     floor = _floor(movements, timings, primitive.kernels)
     scales = torch.ones(1, dtype=torch.float64)
     if len(movements) > 1:

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from zoo.movement.components import alike
 from zoo.movement.kalman import PathNoise
-from zoo.movement.rollout import Primitive, Timing, roll_out
+from zoo.movement.rollout import Primitive, roll_out
 from zoo.movement.sufficient_statistics import sights
+from zoo.movement.timing import Timing
 
 __all__ = ["MovementLaw", "Noise"]
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from zoo.models.primitives.alignment import BasisOf
 from zoo.models.primitives.weights import Basis, Weights
 from zoo.movement.components import alike
-from zoo.movement.rollout import Timing
-from zoo.movement.sufficient_statistics import Movements
+from zoo.movement.timing import Movements, Timing
 
 __all__ = ["Learned", "Noise", "Single", "View", "learn", "maximise", "similarity", "views_of"]
 
