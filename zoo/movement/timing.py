@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 Kind = Literal["discrete", "rhythmic"]
-Movements = Sequence[tuple[Float[Tensor, "time channel"], Bool[Tensor, "time channel"]]]
+Movements = Sequence[tuple[Float[Tensor, "_time _channel"], Bool[Tensor, "_time _channel"]]]
 Template = TypeVar("Template")
 Found = TypeVar("Found")
 

@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zoo.models.baselines.analogues import error_sums
-from zoo.models.baselines.folds import places, starts
+from zoo.models.baselines.places import places, starts
 from zoo.models.baselines.re_entry import Align, Library, Places, dips
+from zoo.movement.cross_validation import splits
 
 __all__ = ["Choice", "Options", "Trials", "forecast"]
 
@@ -87,8 +88,7 @@ class Trials:
     def _continued(self, known: int, options: Options) -> Iterator[Trial]:
         """Every fold continued by the others, in every way but the number of neighbours."""
         whole, ahead = self.library, self.library.values.shape[1] - known
-        for f in range(int(self.fold.max()) + 1):
-            rows = self.fold == f
+        for f, rows in splits(self.fold):
             others = replace(whole, allowed=whole.allowed & ~rows)
             x, mask = whole.values[rows], whole.seen[rows]
             query = x[:, :known], mask[:, :known]

@@ -17,9 +17,10 @@ from zoo.models.baselines.analogues import interpolated
 from zoo.models.baselines.banded import conditional, precision
 from zoo.models.baselines.chain_selection import RIDGES, Choice, Trials
 from zoo.models.baselines.chains import Chain
-from zoo.models.baselines.folds import folds_of, places
 from zoo.models.baselines.observation import moments, observe_in_turn
+from zoo.models.baselines.places import places
 from zoo.movement.components import alike
+from zoo.movement.cross_validation import folds_of
 from zoo.movement.demonstrations import movement_groups, movements_of, seen_entries
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zoo.models.baselines.chains import Chain, chain, lags_up_to, sums_of_runs, unexplained
-from zoo.models.baselines.folds import places, starts
+from zoo.models.baselines.places import places, starts
+from zoo.movement.cross_validation import splits
 
 __all__ = ["RIDGES", "Choice", "Course", "Trials"]
 
@@ -112,7 +113,7 @@ class Trials:
 
     def _parts(self, choice: Choice) -> Iterator[tuple[int, Chain]]:
         """Every fold with the chain of the others."""
-        for f in range(int(self.fold.max()) + 1):
+        for f, _ in splits(self.fold):
             yield f, self.part(choice, f)
 
     def _chain(self, sums: list[Tensor], choice: Choice) -> Chain:
@@ -125,7 +126,7 @@ class Trials:
         frames = self.values.shape[1]
         squares, count = torch.zeros_like(ridge), 0.0
         sums = self.sums(order, jointly)
-        for f in range(int(self.fold.max()) + 1):
+        for f, _ in splits(self.fold):
             part = chain([s.sum(0) - s[f] for s in sums], lags_up_to(order), ridge)
             for k in starts(frames):
                 error, asked = self._missed(part, f, k)

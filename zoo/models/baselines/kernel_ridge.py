@@ -19,7 +19,7 @@ from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogues import carried, interpolated
 from zoo.models.baselines.observation import moments, normal, observe_in_turn
-from zoo.models.baselines.ridge_regression import Kernel, Problem, left_out_squares, predicted
+from zoo.models.baselines.ridge_regression import Kernel, Problem, held_out_squares, predicted
 from zoo.movement.components import alike
 from zoo.movement.demonstrations import movement_groups, movements_of, seen_entries
 from zoo.prediction.predictive import Predictive
@@ -214,7 +214,7 @@ class KernelRidge(nn.Module):
         for pattern in (patterns[i] for i in pick.tolist()):
             line = pattern.line()
             both = self._problem(pattern, torch.cat([0 * line, line], 1))
-            total += left_out_squares(both, KERNELS).unflatten(1, (2, -1)).sum(-1)
+            total += held_out_squares(both, KERNELS).unflatten(1, (2, -1)).sum(-1)
         best = int(total.argmin())
         return KERNELS[best // 2], float(best % 2)
 

@@ -15,10 +15,11 @@ from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogue_selection import Choice, Options, Trials, forecast
 from zoo.models.baselines.analogues import carried, error_sums, interpolated
-from zoo.models.baselines.folds import folds_of, places
 from zoo.models.baselines.gaps import Gaps
 from zoo.models.baselines.observation import moments, normal, observe_in_turn
+from zoo.models.baselines.places import places
 from zoo.models.baselines.re_entry import ALIGNMENTS, Align, Library
+from zoo.movement.cross_validation import folds_of
 from zoo.movement.demonstrations import movement_groups, movements_of, seen_entries
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior

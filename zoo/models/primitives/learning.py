@@ -12,9 +12,10 @@ from torch import Tensor
 
 from zoo.models.primitives.alignment import anchors_of, primitive_timings
 from zoo.models.primitives.communality import blocks, unshared
-from zoo.models.primitives.population import Population, Shares, estimate
+from zoo.models.primitives.population import ParameterShrinkage, Population, estimate
 from zoo.models.primitives.scales import student_scales
 from zoo.movement.conjugate_regression import FLOOR, conjugate_weights
+from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
 from zoo.movement.forcing import locally_weighted_regression, target_force
 from zoo.movement.rollout import Primitive, roll_out
 from zoo.movement.sufficient_statistics import Sums, of_weights, square_after, sums_of
@@ -26,7 +27,6 @@ RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 INDEPENDENT = (0.0, 0.3, 1.0)
 SCALES = {"discrete": 16, "rhythmic": 8}
 LEAST = 3
-FEW = Shares(0.5, 0.5)
 LOW = 0.1
 INFORMATION = (1.0, 0.3, 0.1, 0.03, 0.01)
 FOLDS = 5
@@ -40,15 +40,13 @@ Learning = Literal["path", "force", "lwr"]
 class Learned:
     """p(θ) with the residual variance σ² of every channel, ρ, and the timings of the movements.
 
-    An entry counts as ``information`` of an independent one; ``scales`` are those of the t that a
-    population of few movements is.
+    ``scales`` are those of the t that a population of few movements is.
     """
 
     population: Population
     noise: Float[Tensor, " channel"]
     ratio: Float[Tensor, " channel"]
-    shares: Shares
-    information: float
+    shrinkage: ParameterShrinkage
     scales: Float[Tensor, " scale"]
     timings: tuple[Timing, ...]
 
@@ -91,14 +89,14 @@ def learn(
         parameters, uncertainty = _weights(every.at(own), starts)
     fit, winner = _residuals(every, ratios, parameters, uncertainty)
     whole, early = every.of_channels(winner), begun.of_channels(winner)
-    shares, information = FEW, 1.0
+    shrinkage = ParameterShrinkage()
     if len(movements) >= LEAST:
         entries = _entries(primitive, movements, timings)
-        shares, information = _chosen(_LeftOut(fit, whole, early, entries, floor))
-    population = estimate(fit.parameters, fit.uncertainty, shares, floor)
+        shrinkage = _chosen(_HeldOut(fit, whole, early, entries, floor))
+    population = estimate(fit.parameters, fit.uncertainty, shrinkage, floor)
     if not all(bool(seen.all()) for _, seen in movements):
-        population = _refined(population, whole, fit.noise, shares, floor)
-    return Learned(population, fit.noise, fit.ratio, shares, information, scales, tuple(timings))
+        population = _refined(population, whole, fit.noise, shrinkage, floor)
+    return Learned(population, fit.noise, fit.ratio, shrinkage, scales, tuple(timings))
 
 
 def _ratios(learning: Learning) -> Float[Tensor, " ratio"]:
@@ -163,17 +161,16 @@ def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
     return floor
 
 
-def _chosen(left_out: _LeftOut) -> tuple[Shares, float]:
-    """Shares, and then information, under which entries of movements left out are most probable.
+def _chosen(held_out: _HeldOut) -> ParameterShrinkage:
+    """Shares, and then information, under which entries of held-out movements are most probable.
 
     What a channel has alone is what the others cannot tell of it. Shares are compared at a low
     information: at 1 they would make up for residuals that go together over channels and time,
     which are no matter of movements' parameters.
     """
-    alone = unshared(left_out.fit.parameters)
-    every = [Shares(alone, part) for part in INDEPENDENT]
-    shares = max(every, key=lambda s: left_out.density(s, LOW))
-    return shares, max(INFORMATION, key=lambda c: left_out.density(shares, c))
+    start = ParameterShrinkage(unshared(held_out.fit.parameters), INDEPENDENT[0], LOW)
+    grids = [("independent", INDEPENDENT), ("information", INFORMATION)]
+    return chosen_in_turn(start, grids, held_out.density)
 
 
 @dataclass(frozen=True)
@@ -209,7 +206,7 @@ def _entries(primitive: Primitive, movements: Movements, timings: list[Timing]) 
 
 
 @dataclass(frozen=True)
-class _LeftOut:
+class _HeldOut:
     """Movements in folds, each under the population of the others."""
 
     fit: _Fit
@@ -218,18 +215,18 @@ class _LeftOut:
     entries: _Entries
     floor: Tensor
 
-    def density(self, shares: Shares, information: float) -> float:
-        """Mean log density of single entries left out, to two questions that count alike.
+    def density(self, shrinkage: ParameterShrinkage) -> float:
+        """Mean log density of single held-out entries, to two questions that count alike.
 
         The later three quarters are given the first; a block of channels, another in every fold, is
         given the others. Of single entries: jointly, thousands would count as independent.
         """
-        e, found = self.entries, []
+        e, information, found = self.entries, shrinkage.information, []
         count = e.seen.sum((0, 1)).clamp_min(1)
         rest = (e.errors(self.fit.parameters).square() * e.seen).sum((0, 1)) / count
         rest = rest.clamp_min(FLOOR)
         block = blocks(len(rest))
-        for fold, rows, population in self._folds(shares):
+        for fold, rows, population in self._folds(shrinkage):
             a, b, whole_a, whole_b = self._likelihoods(rows)
             hidden = block == fold % (block.max() + 1)
             known = information * (~hidden).to(b)
@@ -240,13 +237,12 @@ class _LeftOut:
             found.append(_of_entries(filled, here, hidden[None, None], rest))
         return float(torch.stack(found).unflatten(0, (-1, 2)).nanmean(0).nansum())
 
-    def _folds(self, shares: Shares) -> Iterator[tuple[int, Tensor, Population]]:
+    def _folds(self, shrinkage: ParameterShrinkage) -> Iterator[tuple[int, Tensor, Population]]:
         """Every fold, its movements, and the population of the others."""
         parameters = self.fit.parameters
-        folds = torch.arange(len(parameters)) % min(FOLDS, len(parameters))
-        for fold in range(int(folds.max()) + 1):
-            others = parameters[folds != fold]
-            yield fold, folds == fold, estimate(others, self.fit.uncertainty, shares, self.floor)
+        for fold, rows in splits(folds_of(torch.arange(len(parameters)), FOLDS)):
+            others = parameters[~rows]
+            yield fold, rows, estimate(others, self.fit.uncertainty, shrinkage, self.floor)
 
     def _likelihoods(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of the first quarter, and of all."""
@@ -277,9 +273,9 @@ def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _refined(
-    population: Population, whole: Sums, noise: Tensor, shares: Shares, floor: Tensor
+    population: Population, whole: Sums, noise: Tensor, shrinkage: ParameterShrinkage, floor: Tensor
 ) -> Population:
     """The population again, from parameters that it completed itself where frames were missing."""
     part = population.condition(*_likelihood(whole, noise))
     spread = part.private @ part.private.mT + part.factors @ part.factors.mT
-    return estimate(part.mean, spread.mean(0), shares, floor)
+    return estimate(part.mean, spread.mean(0), shrinkage, floor)

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Population", "Shares", "estimate"]
+__all__ = ["ParameterShrinkage", "Population", "estimate"]
 
 
 @dataclass(frozen=True)
@@ -133,21 +133,22 @@ class Population:
 
 
 @dataclass(frozen=True)
-class Shares:
+class ParameterShrinkage:
     """What of its covariance over movements each channel has alone, and of that every parameter.
 
     The sample covariance of n movements has rank n − 1: under it alone a few frames would settle
-    the rest of the movement.
+    the rest of the movement. An entry counts as ``information`` of an independent one.
     """
 
-    alone: Float[Tensor, " channel"] | float
-    independent: float
+    alone: Float[Tensor, " channel"] | float = 0.5
+    independent: float = 0.5
+    information: float = 1.0
 
 
 def estimate(
     parameters: Float[Tensor, "sequence channel parameter"],
     uncertainty: Float[Tensor, "channel parameter parameter"],
-    shares: Shares,
+    shrinkage: ParameterShrinkage,
     floor: Float[Tensor, " parameter"],
 ) -> Population:
     """Population of several movements, its covariance shrunk towards independent parameters.
@@ -167,8 +168,8 @@ def estimate(
     size = deviation.square().sum((0, 2)).clamp_min(torch.finfo(mean.dtype).tiny)
     scaled = deviation / size.sqrt()[:, None]
     shape = torch.einsum("scp,scq->pq", scaled, scaled) / channels
-    shape = torch.lerp(shape, torch.diag(shape.diagonal()), shares.independent)
-    alone = torch.as_tensor(shares.alone, dtype=mean.dtype).view(-1, 1, 1)
+    shape = torch.lerp(shape, torch.diag(shape.diagonal()), shrinkage.independent)
+    alone = torch.as_tensor(shrinkage.alone, dtype=mean.dtype).view(-1, 1, 1)
     private = private + alone * size[:, None, None] * shape
     factors = (1 - alone).sqrt() * deviation.permute(1, 2, 0)
     return Population(mean, factors, _root(private))

@@ -17,7 +17,7 @@ from torch.nn import functional
 from zoo.contract.readiness import check_fitted
 from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
-from zoo.models.primitives.cross_fitting import Choice, Prepared, choose, inflation
+from zoo.models.primitives.cross_fitting import Prepared, WeightShrinkage, choose, inflation
 from zoo.models.primitives.preparation import Preparation
 from zoo.models.primitives.scales import student_scales
 from zoo.models.primitives.weight_hypotheses import WeightHypotheses, WeightPosterior
@@ -247,7 +247,7 @@ class ProMP(nn.Module):
         """φ and S of ``frames`` frames."""
         return self._preparation.basis(self.synergies, frames, timing)
 
-    def _keep(self, all_: Prepared, chosen: Choice, groups: int) -> None:
+    def _keep(self, all_: Prepared, chosen: WeightShrinkage, groups: int) -> None:
         c = self.config
         found = learn(all_.single, all_.views, chosen.share, c.em_iterations, c.em_tolerance)
         self.synergies, self.offset = all_.synergies, all_.offset
