@@ -1,4 +1,4 @@
-"""What is generative in VAE-DMP: a linear latent state, driven by a DMP, decoded frame by frame."""
+"""Networks and constants of VAE-DMP, the densities of its weights and its decoder."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from torch import Tensor, nn
 
 from zoo.contract.settings import Count, Positive, settings
 from zoo.movement.lengths import common_length
-from zoo.movement.plan import Plan
+from zoo.movement.plan import Latents, Plan
 from zoo.movement.response import (
-    Response,
     Transformation,
     discrete_basis,
     input_vector,
@@ -23,7 +22,8 @@ from zoo.movement.response import (
 )
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp
-from zoo.types import Batch, Layout
+from zoo.prediction.predictive import Predictive
+from zoo.types import Layout
 
 __all__ = ["Config", "LatentDmp"]
 
@@ -155,72 +155,20 @@ class LatentDmp(nn.Module):
         size = jacobians(self.decoder, points).square().sum((-1, -2))
         return -self.config.flatness * (size / size.mean() - 1).square()
 
-    def noise_gain(self) -> Float[Tensor, "latent state"]:
-        """G: ε = ε̂ w_ε enters the next state as (77) says."""
-        return (self.system.stiffness * self.w_noise) @ self.step_input
-
-    def initial_state(
-        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
-    ) -> Float[Tensor, "window state"]:
-        """(z*_1, ż_1) of a window's first frame."""
-        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
-
-    def forces(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window latent"]:
-        """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
-        steps = batch.values.shape[1] - 1
-        goal = self.embed(plan.goal)
-        w = self.scaled(plan.w, goal, None if plan.start is None else self.embed(plan.start))
-        pull = goal + self.forcing(w, plan)
-        at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
-        row = at * pull.shape[1] + batch.sequence
-        picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
-        return picked.view(steps, len(batch), -1)
-
-    def forcing(
-        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
-    ) -> Float[Tensor, "step sequence latent"]:
-        """f_t in units of αβ of every step of whole movements, time-major."""
-        return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
-
-    def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
-        """What goal and forcing term add to the state in every step, (77)."""
-        return self.forces(plan, batch) @ self.step_input
-
-    def path(
-        self,
-        z: Float[Tensor, "window latent"],
-        velocity: Float[Tensor, "window latent"],
-        plan: Plan,
-        ε: Float[Tensor, "window step latent"],
-        batch: Batch,
-    ) -> Float[Tensor, "window time latent"]:
-        """z*_{1:T} by the linear response of (75): no loop over time."""
-        steps = batch.values.shape[1]
-        response = Response.of(self.system, steps, z.dtype, z.device)
-        noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
-        force = self.forces(plan, batch) + noise
-        begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
-        states = response.product(begin.flatten(1), force.flatten(1))
-        return states[0].view(steps, len(batch), -1).transpose(0, 1)
-
-    def paths(
-        self,
-        z: Float[Tensor, "*sample window time latent"],
-        velocity: Float[Tensor, "*sample window latent"],
-        plan: Plan,
-        ε: Float[Tensor, "*sample window step latent"],
-        batch: Batch,
-    ) -> Float[Tensor, "*sample window time latent"]:
-        """The paths of every draw of the program's sites, such as Pyro's vectorised particles."""
-        lead = z.shape[:-3]
-        if not lead:
-            return self.path(z[:, 0], velocity, plan, ε, batch)
-        parts = zip(
-            z.flatten(0, -4), velocity.flatten(0, -3), plan.draws(), ε.flatten(0, -4), strict=True
+    def _latents(self, drawn: dict[str, Tensor]) -> Latents:
+        start = self.embed(drawn["start"]) if self.goal_scaling else None
+        goal = self.embed(drawn["goal"])
+        return Latents(
+            w=self.scaled(drawn["w"], goal, start),
+            plan=Plan.of(drawn),
+            goal=goal,
+            position=self.embed(drawn["z"][:, :, 0]),
+            velocity=self.config.velocity_scale * drawn["velocity"],
         )
-        found = [self.path(z[:, 0], v, p, ε, batch) for z, v, p, ε in parts]
-        paths: Tensor = torch.stack(found).unflatten(0, lead)
-        return paths
+
+    def _decoded(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        location = self.decoder(paths.to(self.output_root))
+        return Predictive(location=location, noise=self.output_std, joint=True)
 
     def kernels_at(self, steps: int, duration: float = 1.0) -> Float[Tensor, "step kernel"]:
         """Ψ of the first ``steps`` steps of a movement ``duration`` times as long, in float64."""

@@ -19,9 +19,9 @@ from zoo.errors import NotFittedError
 from zoo.models.filters import latent_dmp
 from zoo.models.filters.cycles import CyclePrior
 from zoo.models.filters.latent_dmp import ALPHA_FRAME
-from zoo.models.filters.latent_path_prior import PRIOR_DRAWS, observed
+from zoo.models.filters.latent_path_prior import PRIOR_DRAWS
 from zoo.models.filters.vae_dmp import VaeDmp
-from zoo.movement.demonstrations import extremes
+from zoo.movement.demonstrations import extremes, seen_entries
 from zoo.movement.plan import Latents, Plan
 from zoo.movement.response import Response, rhythmic_basis
 from zoo.movement.timing import period_of, tempos
@@ -137,7 +137,7 @@ class RhythmicVaeDmp(VaeDmp):
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
         """Keep weights, centres and timings of the training movements, and what they leave."""
-        self.reached = extremes(batch.values, observed(batch))
+        self.reached = extremes(batch.values, seen_entries(batch))
         drawn = posterior.draw(batch, PRIOR_DRAWS)
         found = self._latents(drawn)
         rows = torch.cat([found.w, found.goal.unsqueeze(2)], dim=2)
