@@ -12,6 +12,7 @@ import torch
 from pyro import poutine
 
 import zoo
+from benchmarks.peer_primitive import design, imitated
 from zoo.datasets.records import Sequences
 from zoo.errors import ExtrapolationWarning, NotFittedError
 from zoo.guides.exact import Config as ExactConfig
@@ -20,10 +21,7 @@ from zoo.inference.loader import whole
 from zoo.models.primitives.dmp import DMP, Config
 from zoo.models.primitives.population import Population
 from zoo.movement.forcing import (
-    central_target_force,
-    fit_matrix,
     locally_weighted_regression,
-    ridge_regression,
     stationary_variance,
     target_force,
     trajectory_matrix,
@@ -68,27 +66,16 @@ def test_locally_weighted_regression_is_weighted_least_squares():
             assert float(found[i, c]) == pytest.approx(float(solution[0]), rel=1e-9)
 
 
-def test_fit_matrix_is_the_ridge_regression_of_the_target_force():
-    x = movement()
-    design = discrete_basis(torch.arange(60, dtype=torch.float64), kernels=8, duration=59)
-    expected = ridge_regression(design, central_target_force(x, x[-1], SYSTEM), 0.1)
-    torch.testing.assert_close(fit_matrix(design, SYSTEM, 0.1) @ x, expected, rtol=1e-9, atol=1e-9)
-
-
 def test_weights_and_movement_equal_those_of_movement_primitives():
     peers = pytest.importorskip("movement_primitives.dmp", reason="extra bench is not installed")
     x, frames = movement(frames=200), 200
     peer = peers.DMP(3, execution_time=1.0, dt=1 / 199, int_dt=1 / 199, n_weights_per_dim=12)
     peer.imitate(np.linspace(0, 1, frames), x.numpy())
-    time = torch.arange(frames, dtype=torch.float64)
-    spread = 1 / math.sqrt(-2 * math.log(0.8))
-    basis = discrete_basis(time, kernels=12, duration=199, spread=spread)
-    design = basis * phase(time, duration=199)[:, None]
     system = Transformation(dt=1 / 199)
-    weights = ridge_regression(design, central_target_force(x, x[-1], system))
+    weights = imitated(x, 12, system)
     theirs = torch.from_numpy(peer.forcing_term.weights_.T)
     torch.testing.assert_close(weights, theirs, rtol=1e-8, atol=1e-8 * float(theirs.abs().max()))
-    matrix = trajectory_matrix(Response.of(system, frames), design[1:])
+    matrix = trajectory_matrix(Response.of(system, frames), design(12, frames)[1:])
     path = matrix @ torch.cat([x[:1], torch.zeros_like(x[:1]), x[-1:], theirs])
     expected = torch.from_numpy(peer.open_loop(step_function="euler")[1][:frames])
     torch.testing.assert_close(path, expected, rtol=0, atol=1e-8)

@@ -16,7 +16,7 @@ from zoo.models.primitives.population import ParameterShrinkage, Population, est
 from zoo.models.primitives.scales import student_scales
 from zoo.movement.conjugate_regression import FLOOR, conjugate_weights
 from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
-from zoo.movement.forcing import locally_weighted_regression, target_force
+from zoo.movement.forcing import locally_weighted_regression, target_force, target_known
 from zoo.movement.rollout import Primitive, roll_out
 from zoo.movement.sufficient_statistics import Sums, of_weights, square_after, sums_of
 from zoo.movement.timing import Movements, Timing
@@ -139,7 +139,7 @@ def _local_weights(
     rows = []
     for (x, seen), timing, start in zip(movements, timings, starts, strict=True):
         _, target = target_force(x, start[:, 2], primitive.system(timing))
-        usable = seen[:-1] & seen[1:] & torch.cat([seen[:1], seen[:-2]])
+        usable = target_known(seen.mT).mT
         kernels = primitive.kernel_values(len(x), timing, normalised=False)[:-1]
         gate = primitive.gate(len(x), timing)[:-1]
         rows.append(locally_weighted_regression(kernels, target, scale=gate, mask=usable).T)
