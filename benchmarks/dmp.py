@@ -21,8 +21,8 @@ import zoo
 from benchmarks.harness import Timings, interleave, ratio, report, store
 from benchmarks.peer_primitive import design, imitated
 from zoo.inference.loader import whole
-from zoo.movement import kalman, rollout
-from zoo.movement import sufficient_statistics as sums
+from zoo.models.primitives import kalman, rollout
+from zoo.models.primitives import sufficient_statistics as sums
 from zoo.movement.forcing import trajectory_matrix
 from zoo.movement.response import Response, Transformation
 

@@ -19,16 +19,16 @@ from zoo.guides.exact import Config as ExactConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.loader import whole
 from zoo.models.primitives.dmp import DMP, Config
+from zoo.models.primitives.kalman import PathNoise
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import roll_out
 from zoo.movement.forcing import (
     locally_weighted_regression,
     stationary_variance,
     target_force,
     trajectory_matrix,
 )
-from zoo.movement.kalman import PathNoise
 from zoo.movement.response import Response, Transformation, discrete_basis, phase
-from zoo.movement.rollout import roll_out
 from zoo.movement.timing import Timing, period_of
 from zoo.prediction import mixtures
 from zoo.streams import seeded

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from zoo.models.primitives.conjugate_regression import FLOOR
+from zoo.models.primitives.rollout import Primitive, roll_out
+from zoo.models.primitives.sufficient_statistics import of_weights, sights, squares, sums_of
 from zoo.models.primitives.weights import Basis
-from zoo.movement.conjugate_regression import FLOOR
-from zoo.movement.rollout import Primitive, roll_out
-from zoo.movement.sufficient_statistics import of_weights, sights, squares, sums_of
 from zoo.movement.timing import Movements, Timing, align, duration, period_of, phases
 
 __all__ = ["BasisOf", "anchors", "anchors_of", "basis_timings", "primitive_timings"]

@@ -21,9 +21,9 @@ from zoo.models.primitives.learning import learn
 from zoo.models.primitives.movement_law import MovementLaw, Noise
 from zoo.models.primitives.parameter_hypotheses import AtTiming, ParameterPosterior
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import roll_out
 from zoo.movement.components import Components, Paths, minimum_jerk, ramp
 from zoo.movement.demonstrations import extremes, seen_entries, seen_movements
-from zoo.movement.rollout import roll_out
 from zoo.movement.timing import Timing
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Posterior, Sites, Wishes

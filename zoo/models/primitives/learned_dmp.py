@@ -17,7 +17,7 @@ from zoo.models.primitives.movement_law import Noise
 from zoo.models.primitives.movement_paths import RollOuts
 from zoo.models.primitives.parameter_hypotheses import DirectHypotheses
 from zoo.models.primitives.population import Population
-from zoo.movement.rollout import Primitive
+from zoo.models.primitives.rollout import Primitive
 from zoo.movement.timing import Expected, Timing
 from zoo.types import Layout
 

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from zoo.models.primitives.alignment import anchors_of, primitive_timings
 from zoo.models.primitives.communality import blocks, unshared
+from zoo.models.primitives.conjugate_regression import FLOOR, conjugate_weights
 from zoo.models.primitives.population import ParameterShrinkage, Population, estimate
+from zoo.models.primitives.rollout import Primitive, roll_out
 from zoo.models.primitives.scales import student_scales
-from zoo.movement.conjugate_regression import FLOOR, conjugate_weights
+from zoo.models.primitives.sufficient_statistics import Sums, of_weights, square_after, sums_of
 from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
 from zoo.movement.forcing import locally_weighted_regression, target_force, target_known
-from zoo.movement.rollout import Primitive, roll_out
-from zoo.movement.sufficient_statistics import Sums, of_weights, square_after, sums_of
 from zoo.movement.timing import Movements, Timing
 
 __all__ = ["Learned", "Learning", "learn"]
@@ -109,7 +109,7 @@ def _weights(sums: Sums, starts: Tensor) -> tuple[Tensor, Tensor]:
     """θ of every movement and its mean posterior covariance."""
     precision, linear = of_weights(sums, starts)
     count, square = (sums.count - 3).clamp_min(0), square_after(sums, starts)
-    found = conjugate_weights(precision, linear, square, count, sums.log_volume)
+    found = conjugate_weights(precision, linear, square, count)
     spread = found.noise[:, None, None] * found.covariance.mean(0)
     uncertainty = torch.nn.functional.pad(spread, (3, 0, 3, 0))
     return torch.cat([starts, found.mean], dim=2), uncertainty

@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from zoo.models.primitives.kalman import PathNoise
+from zoo.models.primitives.rollout import Primitive, roll_out
+from zoo.models.primitives.sufficient_statistics import sights
 from zoo.movement.components import alike
-from zoo.movement.kalman import PathNoise
-from zoo.movement.rollout import Primitive, roll_out
-from zoo.movement.sufficient_statistics import sights
 from zoo.movement.timing import Timing
 
 __all__ = ["MovementLaw", "Noise"]

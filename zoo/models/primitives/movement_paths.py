@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from zoo.models.primitives.kalman import PathNoise
 from zoo.models.primitives.movement_law import Noise
 from zoo.models.primitives.parameter_hypotheses import AtTiming
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import Primitive, roll_out
 from zoo.movement.components import Draw, Paths
 from zoo.movement.forcing import trajectory_matrix
-from zoo.movement.kalman import PathNoise
 from zoo.movement.response import Response
-from zoo.movement.rollout import Primitive, roll_out
 from zoo.movement.timing import Timing
 
 __all__ = ["RollOuts", "Term"]

@@ -15,9 +15,9 @@ from torch import Tensor
 from zoo.models.primitives.hypotheses import Drawn, Group, Hypotheses, HypothesisPosterior
 from zoo.models.primitives.movement_law import Noise
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import Primitive
+from zoo.models.primitives.sufficient_statistics import Sight, Sums, in_parts, sights
 from zoo.movement.components import Components, Paths, alike
-from zoo.movement.rollout import Primitive
-from zoo.movement.sufficient_statistics import Sight, Sums, in_parts, sights
 from zoo.movement.timing import Timing
 
 __all__ = [

@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from zoo.models.primitives.kalman import PathNoise
 from zoo.models.primitives.movement_law import Noise
 from zoo.models.primitives.parameter_hypotheses import ParameterHypotheses, Summed
 from zoo.models.primitives.population import Population
 from zoo.models.primitives.projection import Conditional, Latent, Projection, joined
+from zoo.models.primitives.rollout import Primitive, roll_out
 from zoo.movement.components import alike
-from zoo.movement.kalman import PathNoise
-from zoo.movement.rollout import Primitive, roll_out
 from zoo.movement.timing import Timing
 
 __all__ = ["ProjectedHypotheses", "ProjectedLaw"]

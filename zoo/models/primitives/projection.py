@@ -24,10 +24,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from zoo.models.primitives.kalman import PathNoise
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.sufficient_statistics import Sums
 from zoo.movement.components import Draw, Paths
-from zoo.movement.kalman import PathNoise
-from zoo.movement.sufficient_statistics import Sums
 
 __all__ = ["Conditional", "Latent", "Projection", "joined"]
 

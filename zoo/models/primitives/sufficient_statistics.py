@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from zoo.movement.kalman import PathNoise, Smoother
-from zoo.movement.rollout import Primitive, roll_out
+from zoo.models.primitives.kalman import PathNoise, Smoother
+from zoo.models.primitives.rollout import Primitive, roll_out
 from zoo.movement.timing import Movements, Timing
 
 __all__ = [
