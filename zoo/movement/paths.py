@@ -1,4 +1,4 @@
-"""Gaussian mixtures over whole latent paths, and their exact conditioning on the frames seen."""
+"""Gaussian mixtures over whole latent paths, conditioned exactly on the frames observed."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Readout:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A mixture over paths after frames were seen; all components share the covariance.
+    """A mixture over paths after frames were observed; all components share the covariance.
 
     That is the ``prior``'s less what is ``known``, knownᵀ known.
     """

@@ -1,4 +1,4 @@
-r"""Gaussian mixtures over latent limit cycles of unknown timing, conditioned on the frames seen.
+r"""Gaussian mixtures over latent limit cycles of unknown timing, given the frames observed.
 
     z = Φ(τ) u + r,   r ~ GP(0, ν N),   y_t ~ N(z_t, E)
     τ ~ equally likely timings,   u ~ 1/M Σ_i N(ū + √(1−h²)(u_i − ū), B)
@@ -111,7 +111,7 @@ class CyclePrior(KernelMixture):
         """The h, λ and ν under which held-out ``paths`` are forecast best, after ``seen`` frames.
 
         ``readout`` judges draws frame by frame and channel by channel, as Gaussians. What depends
-        on the movement, ν and the frames seen alone is kept.
+        on the movement, ν and the frames observed alone is kept.
         """
         time = torch.arange(paths.shape[1])
         known = dict[tuple[int, float, int], Glimpse]()
@@ -127,7 +127,7 @@ class CyclePrior(KernelMixture):
 
 @dataclass(frozen=True)
 class Glimpse:
-    """The frames seen, whitened by C = ν N + E: designs, and how r elsewhere follows."""
+    """The frames observed, whitened by C = ν N + E: designs, and how r elsewhere follows."""
 
     rows: Int[Tensor, " seen"]
     unroot: Float[Tensor, "seen seen"]
@@ -152,14 +152,14 @@ class Glimpse:
         return cls(rows, unroot, white, white.mT @ white, unroot @ N[rows], noise_root)
 
     def white(self, y: Float[Tensor, "*batch time latent"]) -> Float[Tensor, "*batch seen"]:
-        """What was seen, whitened."""
+        """What was observed, whitened."""
         whitened: Tensor = y.flatten(-2)[..., self.rows] @ self.unroot.mT
         return whitened
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """The mixture after some sequences were seen in the same frames."""
+    """The mixture after some sequences were observed in the same frames."""
 
     prior: CyclePrior
     glimpse: Glimpse
@@ -169,7 +169,7 @@ class Cycle:
     log_weights: Float[Tensor, "sequence timing movement"]
 
     def sample(self, draws: int) -> Float[Tensor, "sample sequence time latent"]:
-        """Joint draws of whole paths; r is drawn unseen and then corrected by what was seen."""
+        """Joint draws of whole paths; r is drawn, then corrected by what was observed."""
         path, prior = self._cycles(draws), self.prior
         r = stationary_draws(prior.residuals, path.shape[2], (draws, len(self.seen)))
         path = path + prior.process**0.5 * r

@@ -39,7 +39,7 @@ class Config:
     would else be unstable. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
     w and ż_1, in units of the acceleration αβ and of the movement's length; ``noise_scale`` is
     where w_ε starts, in the same unit as w, and stays where ``fixed_noise``; ``output_std`` where
-    the constant output spread starts, in scaled units, never below ``output_floor``.
+    the constant σ starts, in scaled units, never below ``output_floor``.
 
     ``goal_scaling`` multiplies the forcing term by z^goal − z_0, the first frame, as §6.3.2 does:
     w then says how a movement goes to its goal, wherever that is. ``common_forcing`` is the
@@ -116,7 +116,7 @@ class LatentDmp(nn.Module):
 
     @property
     def output_std(self) -> Float[Tensor, " channel"]:
-        """The constant spread of every channel, (83)."""
+        """The constant standard deviation of every channel, (83)."""
         return self.output_root.square() + self.config.output_floor
 
     @property
@@ -132,9 +132,9 @@ class LatentDmp(nn.Module):
     def forcing_prior(self, rows: int) -> TorchDistribution:
         """p(w) of ``rows`` movements."""
         shape = [rows, self.kernels, self.latent_dim]
-        zero, spread = self.basis.new_zeros(()), self.config.common_forcing
-        mean = zero if spread is None else self.w_common
-        prior = dist.Normal(mean, zero + (1.0 if spread is None else spread), validate_args=False)
+        zero, std = self.basis.new_zeros(()), self.config.common_forcing
+        mean = zero if std is None else self.w_common
+        prior = dist.Normal(mean, zero + (1.0 if std is None else std), validate_args=False)
         normal: TorchDistribution = prior.expand(shape).to_event(2)
         return normal
 

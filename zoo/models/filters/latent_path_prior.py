@@ -48,13 +48,13 @@ class LatentPathPrior(LatentDmp):
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """Joint draws of the future, given the encoded frames seen; phase 0 is the first frame."""
+        """Joint draws of the future given the encoded frames; phase 0 is the first frame."""
         seen = batch.values.shape[1]
         paths = self._conditioned(batch, need(posterior), seen + horizon).sample(draws)
         return self._decoded(paths[:, :, seen:])
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """Joint draws of whole movements given the entries seen."""
+        """Joint draws of whole movements given the entries observed."""
         paths = self._conditioned(batch, need(posterior), batch.values.shape[1]).sample(draws)
         return self._decoded(paths)
 
@@ -146,7 +146,7 @@ class LatentPathPrior(LatentDmp):
         )
 
     def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
-        """p(z*_{1:length} | frames seen)."""
+        """p(z*_{1:length} | frames observed)."""
         seen = batch.values.shape[1]
         if self.phased:
             check_end(self.label, self.frames, seen, length - seen)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import StudentT
 
 from zoo.models.primitives.alignment import BasisOf
-from zoo.models.primitives.weight_learning import Noise, Single, View
+from zoo.models.primitives.weight_learning import EntryNoise, Single, View
 from zoo.models.primitives.weights import Basis, Weights
 from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
 from zoo.movement.timing import Expected, Movements
@@ -132,12 +132,12 @@ def _density(
 ) -> Tensor:
     """Mean log density of the later entries under a t of n − 1 degrees of freedom."""
     prior = prepared.single.population(shrinkage.share).scaled(inflation(groups))
-    noise = Noise(prepared.single.variance, shrinkage.information)
+    noise = EntryNoise(prepared.single.variance, shrinkage.information)
     scores = [_of_one(prior, noise, movement, groups - 1) for movement in left]
     return torch.stack(scores).sum()
 
 
-def _of_one(prior: Weights, noise: Noise, movement: _HeldOut, degrees: int) -> Tensor:
+def _of_one(prior: Weights, noise: EntryNoise, movement: _HeldOut, degrees: int) -> Tensor:
     evidence, density = [], []
     for begun, later in zip(movement.begun, movement.later, strict=True):
         evidence.append(begun.log_density(prior, noise)[0, 0])

@@ -17,8 +17,8 @@ from torch.nn import functional
 from zoo.datasets.records import Sequences
 from zoo.models.primitives.goals import aimed, recentred
 from zoo.models.primitives.learned_dmp import COMPONENTS, Config, LearnedDmp
-from zoo.models.primitives.learning import learn
-from zoo.models.primitives.movement_law import MovementLaw, Noise
+from zoo.models.primitives.learning import learn_parameters
+from zoo.models.primitives.movement_law import MovementLaw, ResidualNoise
 from zoo.models.primitives.parameter_hypotheses import AtTiming, ParameterPosterior
 from zoo.models.primitives.population import Population
 from zoo.models.primitives.rollout import roll_out
@@ -54,8 +54,8 @@ class DMP(LearnedDmp):
     together over joints and time: below 1 its posterior is a generalised (tempered) one, not Bayes'
     (Bissiri, Holmes & Walker, *A general framework for updating belief distributions*, JRSS B 78,
     2016). What a channel has in V and not in L is the share that a ridge on the other channels
-    cannot tell of movements left out. Information and the share of independent parameters in V are
-    those under which single entries of movements left out are most probable, later ones after the
+    cannot tell of held-out movements. Information and the share of independent parameters in V are
+    those under which single entries of held-out movements are most probable, later ones after the
     first quarter and those of a block of channels given the others; with fewer than three movements
     information is 1 and the shares are one half. Timings, noise and that share of a channel are
     learned from all movements before.
@@ -80,7 +80,7 @@ class DMP(LearnedDmp):
     def condition(self, data: Sequences) -> None:
         """Learn p(θ), the noise, and the durations or the period of the movements."""
         period = None if self.config.period is None else self.config.period * data.rate
-        found = learn(
+        found = learn_parameters(
             self.primitive, self.config.learning, period, data.values, data.mask, data.lengths
         )
         self._keep("reached", extremes(data.values, data.mask))
@@ -114,7 +114,7 @@ class DMP(LearnedDmp):
             a = self._white("shared", self.factors.shape[-1])
             deviation = deviation + torch.einsum("cpr,...r->...cp", self.factors, a)
         θ = self.mean + s[..., None, None] * deviation
-        noise = Noise(self.noise, self.ratio)
+        noise = ResidualNoise(self.noise, self.ratio)
         law = MovementLaw(self.primitive, timings, noise, timing, θ, seen_movements(batch))
         path: Tensor = θ @ designs[timing].mT
         return law, path.mT
@@ -139,7 +139,7 @@ class DMP(LearnedDmp):
         return self._as_predictive(parts, draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """The paths given the entries seen."""
+        """The paths given the entries observed."""
         self._check_fitted()
         timings = self.expected.whole(batch.values.shape[1])
         parts = self._filled(batch.values, seen_entries(batch), timings)

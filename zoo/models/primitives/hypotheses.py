@@ -16,19 +16,19 @@ from torch import Tensor
 from zoo.movement.components import resample
 from zoo.movement.timing import Timing
 
-__all__ = ["Drawn", "Group", "Hypotheses", "HypothesisPosterior"]
+__all__ = ["Alike", "Drawn", "Hypotheses", "HypothesisPosterior"]
 
 Drawn = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
-class Group:
+class Alike:
     """Movements with the same entries observed."""
 
     rows: Int[Tensor, " some"]
 
 
-G = TypeVar("G", bound=Group)
+G = TypeVar("G", bound=Alike)
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Hypotheses(ABC, Generic[G]):
     scales: Float[Tensor, " scale"]
 
     @abstractmethod
-    def groups(
+    def observed_alike(
         self,
         values: Float[Tensor, "sequence time channel"],
         seen: Bool[Tensor, "sequence time channel"],
@@ -48,7 +48,7 @@ class Hypotheses(ABC, Generic[G]):
         ...
 
     @abstractmethod
-    def evidence(self, group: G) -> Float[Tensor, "timing scale sequence"]:
+    def evidence(self, part: G) -> Float[Tensor, "timing scale sequence"]:
         """Log p(x_observed) under every timing and scale."""
         ...
 
@@ -56,11 +56,11 @@ class Hypotheses(ABC, Generic[G]):
         """So many components, or one where there is one hypothesis."""
         return 1 if len(self.timings) * len(self.scales) == 1 else components
 
-    def resampled(self, group: G, count: int) -> Iterator[tuple[int, int, Tensor, Tensor]]:
+    def resampled(self, part: G, count: int) -> Iterator[tuple[int, int, Tensor, Tensor]]:
         """``count`` components of each movement: timing, scale, movements, components of these."""
-        picks = 0 * group.rows[None]
+        picks = 0 * part.rows[None]
         if self.at_most(2) > 1:
-            picks = resample(self.evidence(group).flatten(0, 1), count)
+            picks = resample(self.evidence(part).flatten(0, 1), count)
         for i in picks.unique().tolist():
             some = (picks == i).any(0)
             yield *divmod(i, len(self.scales)), some, picks[:, some] == i
@@ -71,10 +71,10 @@ class HypothesisPosterior(Generic[G]):
 
     def __init__(self, given: Hypotheses[G], x: Tensor, seen: Tensor) -> None:
         """Weigh every timing and scale of every movement."""
-        self.groups = list(given.groups(x, seen))
+        self.parts = list(given.observed_alike(x, seen))
         self.evidence = x.new_empty(len(given.timings), len(given.scales), len(x))
-        for group in self.groups:
-            self.evidence[..., group.rows] = given.evidence(group)
+        for part in self.parts:
+            self.evidence[..., part.rows] = given.evidence(part)
 
     def log_evidence(self) -> Float[Tensor, " sequence"]:
         """Log p(x_observed) of every movement, all unknowns integrated out."""

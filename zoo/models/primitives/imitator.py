@@ -87,7 +87,7 @@ class Imitator:
         path: Float[Tensor, "*batch time latent"],
         seen: Bool[Tensor, "*batch time"] | None = None,
     ) -> Float[Tensor, "*batch parameter latent"]:
-        """θ of the roll-outs nearest to ``path`` where it was seen, by ridge regression."""
+        """θ of the roll-outs nearest to ``path`` where it was observed, by ridge regression."""
         if seen is None:
             return _gain(self).to(path) @ path
         design, weight = self.design().to(path.device), seen.double()[..., None]

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from zoo.contract.settings import Positive, settings
 from zoo.errors import NotFittedError
 from zoo.models.primitives.alignment import DIRECTIONS, TEMPOS
-from zoo.models.primitives.learning import Learned, Learning
-from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.learning import LearnedParameters, Learning
+from zoo.models.primitives.movement_law import ResidualNoise
 from zoo.models.primitives.movement_paths import RollOuts
 from zoo.models.primitives.parameter_hypotheses import DirectHypotheses
 from zoo.models.primitives.population import Population
@@ -105,15 +105,15 @@ class LearnedDmp(nn.Module):
 
     @property
     def _roll_outs(self) -> RollOuts:
-        return RollOuts(self.primitive, Noise(self.noise, self.ratio))
+        return RollOuts(self.primitive, ResidualNoise(self.noise, self.ratio))
 
     def _given(self, timings: Sequence[Timing]) -> DirectHypotheses:
-        noise = Noise(self.noise, self.ratio)
+        noise = ResidualNoise(self.noise, self.ratio)
         return DirectHypotheses(
             timings, self.scales, self.primitive, self.population, noise, float(self.information)
         )
 
-    def _keep_learned(self, found: Learned) -> None:
+    def _keep_learned(self, found: LearnedParameters) -> None:
         """Keep p(θ), the noise, and the durations or the period of the movements."""
         expected = Expected.of(self.config.kind, found.timings, len(TEMPOS), DIRECTIONS)
         self._keep("mean", found.population.mean)

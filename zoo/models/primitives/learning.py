@@ -21,7 +21,7 @@ from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
 from zoo.movement.forcing import locally_weighted_regression, target_force, target_known
 from zoo.movement.timing import Movements, Timing
 
-__all__ = ["Learned", "Learning", "learn"]
+__all__ = ["LearnedParameters", "Learning", "learn_parameters"]
 
 RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 INDEPENDENT = (0.0, 0.3, 1.0)
@@ -37,7 +37,7 @@ Learning = Literal["path", "force", "lwr"]
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedParameters:
     """p(θ) with the residual variance σ² of every channel, ρ, and the timings of the movements.
 
     ``scales`` are those of the t that a population of few movements is.
@@ -61,14 +61,14 @@ class _Fit:
     ratio: Float[Tensor, " channel"]
 
 
-def learn(
+def learn_parameters(
     primitive: Primitive,
     learning: Learning,
     period: float | None,
     values: Float[Tensor, "sequence time channel"],
     mask: Bool[Tensor, "sequence time channel"],
     lengths: Int[Tensor, " sequence"],
-) -> Learned:
+) -> LearnedParameters:
     """Weights of every movement, noise by their evidence, and the population over movements."""
     movements = [
         (x[:n], seen[:n]) for x, seen, n in zip(values, mask, lengths.tolist(), strict=True)
@@ -96,7 +96,7 @@ def learn(
     population = estimate(fit.parameters, fit.uncertainty, shrinkage, floor)
     if not all(bool(seen.all()) for _, seen in movements):
         population = _refined(population, whole, fit.noise, shrinkage, floor)
-    return Learned(population, fit.noise, fit.ratio, shrinkage, scales, tuple(timings))
+    return LearnedParameters(population, fit.noise, fit.ratio, shrinkage, scales, tuple(timings))
 
 
 def _ratios(learning: Learning) -> Float[Tensor, " ratio"]:
@@ -110,8 +110,8 @@ def _weights(sums: Sums, starts: Tensor) -> tuple[Tensor, Tensor]:
     precision, linear = of_weights(sums, starts)
     count, square = (sums.count - 3).clamp_min(0), square_after(sums, starts)
     found = conjugate_weights(precision, linear, square, count)
-    spread = found.noise[:, None, None] * found.covariance.mean(0)
-    uncertainty = torch.nn.functional.pad(spread, (3, 0, 3, 0))
+    covariance = found.noise[:, None, None] * found.covariance.mean(0)
+    uncertainty = torch.nn.functional.pad(covariance, (3, 0, 3, 0))
     return torch.cat([starts, found.mean], dim=2), uncertainty
 
 
@@ -149,7 +149,7 @@ def _local_weights(
 
 
 def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
-    """Least variance of the parameters; of one movement alone the spread over its own time."""
+    """Least variance of the parameters; of one movement alone the variance over its own time."""
     floor = torch.full((3 + kernels,), 1e-8, dtype=torch.float64)
     if len(movements) == 1:
         ((x, seen),) = movements
@@ -257,12 +257,12 @@ def _of_entries(
     asked: Bool[Tensor, "#sequence #place #channel"],
     rest: Float[Tensor, " channel"],
 ) -> Tensor:
-    """Mean log density of the entries asked, up to a constant; NaN where none was seen."""
+    """Mean log density of the entries asked, up to a constant; NaN where none was observed."""
     root = torch.cat([population.factors, population.private], dim=-1)
     alike = bool((entries.design == entries.design[0]).all())
     design = entries.design[:1] if alike else entries.design
-    spread = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
-    variance = spread + rest
+    path = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
+    variance = path + rest
     density = -(entries.errors(population.mean).square() / variance + variance.log()) / 2
     mean: Tensor = density[entries.seen & asked].mean()
     return mean
@@ -277,5 +277,5 @@ def _refined(
 ) -> Population:
     """The population again, from parameters that it completed itself where frames were missing."""
     part = population.condition(*_likelihood(whole, noise))
-    spread = part.private @ part.private.mT + part.factors @ part.factors.mT
-    return estimate(part.mean, spread.mean(0), shrinkage, floor)
+    covariance = part.private @ part.private.mT + part.factors @ part.factors.mT
+    return estimate(part.mean, covariance.mean(0), shrinkage, floor)

@@ -17,11 +17,11 @@ from zoo.models.primitives.sufficient_statistics import sights
 from zoo.movement.components import alike
 from zoo.movement.timing import Timing
 
-__all__ = ["MovementLaw", "Noise"]
+__all__ = ["MovementLaw", "ResidualNoise"]
 
 
 @dataclass(frozen=True)
-class Noise:
+class ResidualNoise:
     """σ and ρ of every channel."""
 
     std: Float[Tensor, " channel"]
@@ -40,7 +40,7 @@ class MovementLaw(TorchDistribution):
         self,
         primitive: Primitive,
         timings: Sequence[Timing],
-        noise: Noise,
+        noise: ResidualNoise,
         timing: Int[Tensor, "*batch"],
         θ: Float[Tensor, "*batch channel parameter"],
         seen: Bool[Tensor, "sequence time channel"],

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zoo.models.primitives.kalman import PathNoise
-from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.movement_law import ResidualNoise
 from zoo.models.primitives.parameter_hypotheses import AtTiming
 from zoo.models.primitives.population import Population
 from zoo.models.primitives.rollout import Primitive, roll_out
@@ -30,7 +30,7 @@ class RollOuts:
     """Paths y = Σ R θ + σ N ε of a primitive, θ Gaussian in every term."""
 
     primitive: Primitive
-    noise: Noise
+    noise: ResidualNoise
 
     def anew(self, at: AtTiming, frames: int) -> Paths:
         """p(θ | x) rolled out over ``frames`` frames, with new forces."""
@@ -41,8 +41,8 @@ class RollOuts:
         """Sum of design θ over ``terms``, with new forces."""
         mean, variance, draw = _sum(terms)
         noise, σ = self._noise(len(terms[0][0]), timing), self.noise.std
-        spread = noise.variance[:, None] * σ.square()
-        return Paths(mean, variance + spread, lambda n: draw(n) + σ * noise.draw(n, mean))
+        forces = noise.variance[:, None] * σ.square()
+        return Paths(mean, variance + forces, lambda n: draw(n) + σ * noise.draw(n, mean))
 
     def followed(self, at: AtTiming) -> Paths:
         """The paths given the entries observed; draws by Matheron."""
@@ -55,8 +55,8 @@ class RollOuts:
             return view.follow(at.x) + σ * (force - view.follow(pseudo))
 
         mean, variance, draw = _sum([(view.given, at.population)])
-        spread = view.smoother.variance.mT * σ.square()
-        return Paths(mean + view.follow(at.x), variance + spread, lambda n: draw(n) + residual(n))
+        left = view.smoother.variance.mT * σ.square()
+        return Paths(mean + view.follow(at.x), variance + left, lambda n: draw(n) + residual(n))
 
     def part(
         self, timing: Timing, share: Float[Tensor, " step"], *, begin: bool

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from zoo.models.primitives.hypotheses import Drawn, Group, Hypotheses, HypothesisPosterior
-from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.hypotheses import Alike, Drawn, Hypotheses, HypothesisPosterior
+from zoo.models.primitives.movement_law import ResidualNoise
 from zoo.models.primitives.population import Population
 from zoo.models.primitives.rollout import Primitive
 from zoo.models.primitives.sufficient_statistics import Sight, Sums, in_parts, sights
@@ -40,7 +40,7 @@ class AtTiming:
 
 
 @dataclass(frozen=True)
-class Summed(Group):
+class Summed(Alike):
     """Movements with the same entries observed: what they say of θ at every timing."""
 
     x: Float[Tensor, "some time channel"]
@@ -63,7 +63,7 @@ class ParameterHypotheses(Hypotheses[G]):
 
     primitive: Primitive
     population: Population
-    noise: Noise
+    noise: ResidualNoise
     information: float
 
     def likelihood(self, sums: Sums) -> tuple[Tensor, Tensor]:
@@ -71,46 +71,46 @@ class ParameterHypotheses(Hypotheses[G]):
         weight = self.information / self.noise.std.square()
         return sums.precision * weight[:, None, None], sums.linear * weight[:, None]
 
-    def evidence(self, group: G) -> Float[Tensor, "timing scale sequence"]:
+    def evidence(self, part: G) -> Float[Tensor, "timing scale sequence"]:
         """log ∫ p(θ) p(x | θ)^information dθ of every timing and scale."""
         population, variance = self.population, self.noise.std.square()
-        fits = [population.log_evidences(self.scales, *self.likelihood(s)) for s in group.sums]
-        at_zero = [self.information * s.log_density(variance) for s in group.sums]
+        fits = [population.log_evidences(self.scales, *self.likelihood(s)) for s in part.sums]
+        at_zero = [self.information * s.log_density(variance) for s in part.sums]
         pairs = zip(at_zero, fits, strict=True)
         return torch.stack([zero + fit for zero, fit in pairs])
 
-    def likeliest(self, group: G) -> Int[Tensor, " some"]:
+    def likeliest(self, part: G) -> Int[Tensor, " some"]:
         """The likeliest timing of every movement."""
         if len(self.timings) == 1:
-            return torch.zeros_like(group.rows)
-        return self.evidence(group).logsumexp(1).argmax(0)
+            return torch.zeros_like(part.rows)
+        return self.evidence(part).logsumexp(1).argmax(0)
 
-    def picked(self, group: G, count: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+    def picked(self, part: G, count: int) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
         """Timings and scales resampled to ``count``: timing, scale, movements, components of these.
 
         One alone is the likeliest timing, with the usual scale: whole movements tell their θ.
         """
         if count > 1:
-            for timing, scale, some, which in self.resampled(group, count):
+            for timing, scale, some, which in self.resampled(part, count):
                 yield timing, self.scales[scale], some, which
             return
-        likeliest = self.likeliest(group)
+        likeliest = self.likeliest(part)
         for timing in likeliest.unique().tolist():
             some = likeliest == timing
             yield timing, self.scales.new_ones(()), some, some[None, some]
 
-    def posterior(self, group: G, timing: int, scale: Tensor, some: Tensor) -> Population:
-        """p(θ | x) of some movements of a group."""
+    def posterior(self, part: G, timing: int, scale: Tensor, some: Tensor) -> Population:
+        """p(θ | x) of some movements of a part."""
         p = self.population
         prior = Population(p.mean, scale * p.factors, scale * p.private)
-        return prior.condition(*self.likelihood(group.sums[timing].of_movements(some)))
+        return prior.condition(*self.likelihood(part.sums[timing].of_movements(some)))
 
 
 @dataclass(frozen=True)
 class DirectHypotheses(ParameterHypotheses[Sighted]):
     """Timings and scales of movements whose channels are seen as they are."""
 
-    def groups(
+    def observed_alike(
         self,
         values: Float[Tensor, "sequence time channel"],
         seen: Bool[Tensor, "sequence time channel"],
@@ -129,9 +129,9 @@ class DirectHypotheses(ParameterHypotheses[Sighted]):
         self, values: Tensor, seen: Tensor, count: int
     ) -> Iterator[tuple[Tensor, Tensor, AtTiming]]:
         """Rows, which of ``count`` components they are, and p(θ | x)."""
-        for group in self.groups(values, seen):
-            for timing, scale, some, which in self.picked(group, count):
-                yield group.rows[some], which, self.at_timing(group, timing, scale, some)
+        for part in self.observed_alike(values, seen):
+            for timing, scale, some, which in self.picked(part, count):
+                yield part.rows[some], which, self.at_timing(part, timing, scale, some)
 
     def mixture(
         self, values: Tensor, seen: Tensor, count: int, render: Callable[[AtTiming], Paths]
@@ -148,17 +148,17 @@ class DirectHypotheses(ParameterHypotheses[Sighted]):
     def demonstrated(self, values: Tensor, seen: Tensor) -> list[AtTiming]:
         """The likeliest timing of every movement, with the usual scale, and p(θ | x)."""
         found, one = dict[int, AtTiming](), self.scales.new_ones(())
-        for group in self.groups(values, seen):
-            best = self.likeliest(group).tolist()
-            for j, (row, i) in enumerate(zip(group.rows.tolist(), best, strict=True)):
-                found[row] = self.at_timing(group, i, one, torch.tensor([j]))
+        for part in self.observed_alike(values, seen):
+            best = self.likeliest(part).tolist()
+            for j, (row, i) in enumerate(zip(part.rows.tolist(), best, strict=True)):
+                found[row] = self.at_timing(part, i, one, torch.tensor([j]))
         return [found[row] for row in range(len(values))]
 
-    def at_timing(self, group: Sighted, timing: int, scale: Tensor, some: Tensor) -> AtTiming:
-        """p(θ | x) of some movements of a group."""
-        posterior = self.posterior(group, timing, scale, some)
-        x = group.x if len(some) == len(group.x) and bool(some.all()) else group.x[some]
-        return AtTiming(posterior, group.sights[timing], self.timings[timing], x)
+    def at_timing(self, part: Sighted, timing: int, scale: Tensor, some: Tensor) -> AtTiming:
+        """p(θ | x) of some movements of a part."""
+        posterior = self.posterior(part, timing, scale, some)
+        x = part.x if len(some) == len(part.x) and bool(some.all()) else part.x[some]
+        return AtTiming(posterior, part.sights[timing], self.timings[timing], x)
 
 
 class ParameterPosterior(HypothesisPosterior[G]):
@@ -189,12 +189,12 @@ class ParameterPosterior(HypothesisPosterior[G]):
         timing, (channels, parameters) = drawn["timing"], self.given.population.mean.shape
         linear = self.evidence.new_empty(*timing.shape, channels, parameters)
         precision = linear.new_empty(*linear.shape, parameters)
-        for group in self.groups:
-            chosen = timing[..., group.rows]
+        for part in self.parts:
+            chosen = timing[..., part.rows]
             for i in chosen.unique().tolist():
                 *lead, which = (chosen == i).nonzero(as_tuple=True)
-                index = (*lead, group.rows[which])
-                sums = group.sums[i].of_movements(which)
+                index = (*lead, part.rows[which])
+                sums = part.sums[i].of_movements(which)
                 precision[index], linear[index] = self.given.likelihood(sums)
         s = self.given.scales[drawn["scale"]][..., None, None, None]
         p = self.given.population

@@ -161,7 +161,7 @@ class PcaDmp(nn.Module):
         return _predictive(parts, self.pca.noise, draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """The paths given the entries seen."""
+        """The paths given the entries observed."""
         seen = seen_entries(batch)
         return self._filled(batch.values, seen, _whole(seen), 0, draws)
 
@@ -253,11 +253,11 @@ class PcaDmp(nn.Module):
         """W z + μ of components counted as independent."""
         view = self._projection
         square = view.loading.square().T
-        spread = None if latent.epistemic is None else latent.epistemic.square() @ square
+        variance = None if latent.epistemic is None else latent.epistemic.square() @ square
         return Predictive(
             location=view.shown(latent.location),
             noise=(view.white @ square + view.noise.square()).sqrt(),
-            epistemic=None if spread is None else spread.sqrt(),
+            epistemic=None if variance is None else variance.sqrt(),
             draws=latent.redrawn(view.shown),
         )
 

@@ -4,7 +4,7 @@ A movement i has one parameter vector θ_ic for every channel c::
 
     a_i ~ N(0, I_r),   δ_ic ~ N(0, V_c V_cᵀ),   θ_ic = μ_c + L_c a_i + δ_ic
 
-The factors a carry what channels have in common, δ what each has alone. Seen data enter as a
+The factors a carry what channels have in common, δ what each has alone. Observed data enter as a
 Gaussian likelihood with precision A_c and linear term b_c of every channel; the posterior is of
 the same form, exactly.
 """
@@ -110,8 +110,8 @@ class Population:
         root = torch.cat([self.factors, self.private], dim=-1)
         if self.factors.shape[-1]:
             root = torch.linalg.qr(root.mT, mode="r")[1].mT
-        spread = torch.linalg.vector_norm(design @ root, dim=-1).square()
-        return self.path(design).mT, spread.mT
+        variance = torch.linalg.vector_norm(design @ root, dim=-1).square()
+        return self.path(design).mT, variance.mT
 
     def path(
         self, design: Float[Tensor, "*channel time parameter"]

@@ -21,7 +21,7 @@ from zoo.models.primitives.cross_fitting import Prepared, WeightShrinkage, choos
 from zoo.models.primitives.preparation import Preparation
 from zoo.models.primitives.scales import student_scales
 from zoo.models.primitives.weight_hypotheses import WeightHypotheses, WeightPosterior
-from zoo.models.primitives.weight_learning import Noise, learn
+from zoo.models.primitives.weight_learning import EntryNoise, learn_weights
 from zoo.models.primitives.weights import Basis, Weights, superposed
 from zoo.movement.components import Components, Paths, ramp
 from zoo.movement.demonstrations import (
@@ -51,7 +51,7 @@ class Config:
     movements is in s; None finds it by autocorrelation.
     ``shrinkage`` is the share of the inverse-Wishart prior in Σ; ``information`` is the part of an
     independent observation that every entry counts, 1 for Bayes' rule. None chooses them by the
-    density of movements left out. EM ends after ``em_iterations`` or a gain of ``em_tolerance``
+    density of held-out movements. EM ends after ``em_iterations`` or a gain of ``em_tolerance``
     nats an entry.
     """
 
@@ -87,7 +87,7 @@ class ProMP(nn.Module):
     entry as ``information`` of an independent one, since residuals go together over channels and
     time: below 1 its posterior is a generalised one, not Bayes' (Bissiri, Holmes & Walker, *A
     general framework for updating belief distributions*, JRSS B 78, 2016). Share of the prior and
-    information are those under which movements left out are most probable after their first
+    information are those under which held-out movements are most probable after their first
     quarter, alignment, synergies, mean and noise made without them; windows of one movement are
     left out together. Data are standardised before, all training movements together.
 
@@ -147,7 +147,7 @@ class ProMP(nn.Module):
         """Learn p(w), the noise, and the durations or the period of the movements."""
         movements = movements_of("promp", data, self.dtype)
         if len(movements) < 2:
-            raise ValueError("promp needs at least 2 movements for their spread; got 1")
+            raise ValueError("promp needs at least 2 movements to see how they differ; got 1")
         rows = zip(movements.values, movements.mask, movements.lengths.tolist(), strict=True)
         inside = [(x[:n], seen[:n]) for x, seen, n in rows]
         self.reached = extremes(movements.values, movements.mask)
@@ -249,7 +249,9 @@ class ProMP(nn.Module):
 
     def _keep(self, all_: Prepared, chosen: WeightShrinkage, groups: int) -> None:
         c = self.config
-        found = learn(all_.single, all_.views, chosen.share, c.em_iterations, c.em_tolerance)
+        found = learn_weights(
+            all_.single, all_.views, chosen.share, c.em_iterations, c.em_tolerance
+        )
         self.synergies, self.offset = all_.synergies, all_.offset
         self.mean, self.noise = found.weights.mean, found.variance.sqrt()
         self.root = found.weights.root * inflation(groups)
@@ -261,7 +263,7 @@ class ProMP(nn.Module):
 
     def _given(self, timings: list[Timing], *, whole: bool = False) -> WeightHypotheses:
         """What is possible before an entry was observed; ``whole`` entries count 1."""
-        noise = Noise(self.noise.square(), 1.0 if whole else float(self.information))
+        noise = EntryNoise(self.noise.square(), 1.0 if whole else float(self.information))
         return WeightHypotheses(timings, self.scales, self.weights, noise, self.basis)
 
     def _posteriors(self, batch: Batch) -> WeightPosterior:

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from zoo.models.primitives.alignment import BasisOf
-from zoo.models.primitives.hypotheses import Drawn, Group, Hypotheses, HypothesisPosterior
-from zoo.models.primitives.weight_learning import Noise, View
+from zoo.models.primitives.hypotheses import Alike, Drawn, Hypotheses, HypothesisPosterior
+from zoo.models.primitives.weight_learning import EntryNoise, View
 from zoo.models.primitives.weights import Weights, superposed
 from zoo.movement.components import Components, alike
 from zoo.movement.timing import Timing
@@ -21,7 +21,7 @@ __all__ = ["WeightHypotheses", "WeightPosterior"]
 
 
 @dataclass(frozen=True)
-class Viewed(Group):
+class Viewed(Alike):
     """Movements with the same entries observed, at every timing."""
 
     views: list[View]
@@ -32,10 +32,10 @@ class WeightHypotheses(Hypotheses[Viewed]):
     """p(w) at every timing and scale: w ~ N(μ, s²Σ)."""
 
     prior: Weights
-    noise: Noise
+    noise: EntryNoise
     basis: BasisOf
 
-    def groups(
+    def observed_alike(
         self,
         values: Float[Tensor, "sequence time channel"],
         seen: Bool[Tensor, "sequence time channel"],
@@ -46,9 +46,9 @@ class WeightHypotheses(Hypotheses[Viewed]):
             views = [View(rows, self.basis(len(mask), t), mask, known) for t in self.timings]
             yield Viewed(rows, views)
 
-    def evidence(self, group: Viewed) -> Float[Tensor, "timing scale sequence"]:
+    def evidence(self, part: Viewed) -> Float[Tensor, "timing scale sequence"]:
         """Log p(x_observed) under every timing and scale."""
-        each = [view.log_density(self.prior, self.noise, self.scales) for view in group.views]
+        each = [view.log_density(self.prior, self.noise, self.scales) for view in part.views]
         return torch.stack(each)
 
     def posterior(self, view: View, scale: int) -> Weights:
@@ -60,9 +60,9 @@ class WeightHypotheses(Hypotheses[Viewed]):
         count = self.at_most(count)
         parts = Components.empty(count, x)
         whole = x.new_ones(x.shape[1])
-        for group in self.groups(x, seen):
-            for timing, scale, some, which in self.resampled(group, count):
-                view = group.views[timing].only(some)
+        for part in self.observed_alike(x, seen):
+            for timing, scale, some, which in self.resampled(part, count):
+                view = part.views[timing].only(some)
                 path = superposed([(view.basis, self.posterior(view, scale), whole)])
                 parts.put(view.rows, which, path)
         return parts
@@ -70,9 +70,9 @@ class WeightHypotheses(Hypotheses[Viewed]):
     def demonstrated(self, x: Tensor, seen: Tensor) -> list[tuple[Timing, Weights]]:
         """The likeliest timing of every movement and the posterior of its weights."""
         found = dict[int, tuple[Timing, Weights]]()
-        for group in self.groups(x, seen):
-            for i, scale, some, _ in self.resampled(group, 1):
-                view = group.views[i].only(some)
+        for part in self.observed_alike(x, seen):
+            for i, scale, some, _ in self.resampled(part, 1):
+                view = part.views[i].only(some)
                 weights = self.posterior(view, scale)
                 for row, mean in zip(view.rows.tolist(), weights.mean, strict=True):
                     found[row] = (self.timings[i], Weights(mean[None], weights.root))
@@ -93,11 +93,11 @@ class WeightPosterior(HypothesisPosterior[Viewed]):
         size = self.given.prior.mean.shape[-1]
         mean = self.evidence.new_empty(*timing.shape, size)
         lower = self.evidence.new_empty(*timing.shape, size, size)
-        for group in self.groups:
-            kinds = torch.stack([timing[..., group.rows], scale[..., group.rows]], -1)
+        for part in self.parts:
+            kinds = torch.stack([timing[..., part.rows], scale[..., part.rows]], -1)
             for kind in kinds.flatten(0, -2).unique(dim=0):
                 *lead, which = (kinds == kind).all(-1).nonzero(as_tuple=True)
-                found = self.given.posterior(group.views[int(kind[0])], int(kind[1]))
-                mean[(*lead, group.rows[which])] = found.mean[which]
-                lower[(*lead, group.rows[which])] = found.lower
+                found = self.given.posterior(part.views[int(kind[0])], int(kind[1]))
+                mean[(*lead, part.rows[which])] = found.mean[which]
+                lower[(*lead, part.rows[which])] = found.lower
         return dist.MultivariateNormal(mean, scale_tril=lower)

@@ -139,7 +139,7 @@ class SparseGaussianProcess(nn.Module):
 
     @torch.no_grad()
     def regress(self, inputs: Float[Tensor, "item feature"], *, draws: int) -> Predictive:
-        """Mean, latent and noise spread of every target; joint draws over not too many items."""
+        """Mean and standard deviations of every target; joint draws over not too many items."""
         k = self._kernel(self.inducing, inputs)
         v = torch.linalg.solve_triangular(self.factor, k, upper=False)
         mean = v.mT @ self.mean
