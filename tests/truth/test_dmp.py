@@ -98,7 +98,7 @@ def random_population(channels=CHANNELS, parameters=4, factors=2):
 
 def dense(population):
     """Mean and covariance of the channels' parameters in one vector."""
-    shared = population.factors.flatten(0, 1)
+    shared = population.loadings.flatten(0, 1)
     alone = torch.block_diag(*(v @ v.T for v in population.private))
     return population.mean.flatten(), shared @ shared.T + alone
 
@@ -115,7 +115,7 @@ def test_population_is_a_dense_gaussian():
     found = population.condition(precision, linear)
     expected = torch.linalg.solve(total, right.T).T
     torch.testing.assert_close(found.mean.flatten(1), expected, rtol=1e-8, atol=1e-8)
-    one = Population(found.mean[0], found.factors, found.private)
+    one = Population(found.mean[0], found.loadings, found.private)
     torch.testing.assert_close(dense(one)[1], torch.linalg.inv(total), rtol=1e-8, atol=1e-8)
     evidence = (
         (right * expected).sum(1) - mean @ information @ mean - torch.logdet(total @ covariance)

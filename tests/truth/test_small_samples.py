@@ -59,7 +59,7 @@ def test_parameters_of_few_movements_are_as_wide_as_a_new_one_is_far(
         shape = (MOVEMENTS, CHANNELS, KERNELS)
         θ = torch.randn(shape, generator=generator, dtype=torch.float64)
         found = estimate(θ, flat, shares, torch.zeros(KERNELS, dtype=torch.float64))
-        parts = (found.factors, found.private)
+        parts = (found.loadings, found.private)
         sizes.append(sum(float(part.square().sum(-1).mean()) for part in parts))
     error = np.sqrt(2 / (MOVEMENTS - 1) / (sets * KERNELS * CHANNELS))
     assert np.mean(sizes) == pytest.approx(1 + 1 / MOVEMENTS, abs=5 * error)

@@ -117,7 +117,7 @@ class LearnedDmp(nn.Module):
         """Keep p(θ), the noise, and the durations or the period of the movements."""
         expected = Expected.of(self.config.kind, found.timings, len(TEMPOS), DIRECTIONS)
         self._keep("mean", found.population.mean)
-        self._keep("factors", found.population.factors)
+        self._keep("factors", found.population.loadings)
         self._keep("private", found.population.private)
         self._keep("noise", found.noise.sqrt())
         self._keep("ratio", found.ratio)

@@ -258,7 +258,7 @@ def _of_entries(
     rest: Float[Tensor, " channel"],
 ) -> Tensor:
     """Mean log density of the entries asked, up to a constant; NaN where none was observed."""
-    root = torch.cat([population.factors, population.private], dim=-1)
+    root = torch.cat([population.loadings, population.private], dim=-1)
     alike = bool((entries.design == entries.design[0]).all())
     design = entries.design[:1] if alike else entries.design
     path = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
@@ -277,5 +277,5 @@ def _refined(
 ) -> Population:
     """The population again, from parameters that it completed itself where frames were missing."""
     part = population.condition(*_likelihood(whole, noise))
-    covariance = part.private @ part.private.mT + part.factors @ part.factors.mT
+    covariance = part.private @ part.private.mT + part.loadings @ part.loadings.mT
     return estimate(part.mean, covariance.mean(0), shrinkage, floor)

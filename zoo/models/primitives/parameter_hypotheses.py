@@ -102,7 +102,7 @@ class ParameterHypotheses(Hypotheses[G]):
     def posterior(self, part: G, timing: int, scale: Tensor, some: Tensor) -> Population:
         """p(θ | x) of some movements of a part."""
         p = self.population
-        prior = Population(p.mean, scale * p.factors, scale * p.private)
+        prior = Population(p.mean, scale * p.loadings, scale * p.private)
         return prior.condition(*self.likelihood(part.sums[timing].of_movements(some)))
 
 
@@ -178,7 +178,7 @@ class ParameterPosterior(HypothesisPosterior[G]):
     def private(self, drawn: Drawn) -> dist.TorchDistribution:
         """p(V⁻¹δ | a, timing, scale, x)."""
         a, b, p = self._conditions(drawn)
-        none = b.new_zeros(*b.shape[:-2], p.factors.shape[-1])
+        none = b.new_zeros(*b.shape[:-2], p.loadings.shape[-1])
         mean, root = p.private_posterior(a, b, drawn.get("shared", none))
         white = dist.MultivariateNormal(mean, precision_matrix=root @ root.mT)
         law: dist.TorchDistribution = white.to_event(1)
@@ -198,4 +198,4 @@ class ParameterPosterior(HypothesisPosterior[G]):
                 precision[index], linear[index] = self.given.likelihood(sums)
         s = self.given.scales[drawn["scale"]][..., None, None, None]
         p = self.given.population
-        return precision, linear, Population(p.mean, s * p.factors, s * p.private)
+        return precision, linear, Population(p.mean, s * p.loadings, s * p.private)

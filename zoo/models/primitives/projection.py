@@ -125,7 +125,7 @@ class GivenEntries:
 
     def _covariance(self, p: Population) -> Float[Tensor, "#sequence time latent latent"]:
         """Of all components at every time."""
-        together = self._unfolded((self._given @ p.factors).movedim(-1, 0))
+        together = self._unfolded((self._given @ p.loadings).movedim(-1, 0))
         shared = torch.einsum("f...tk,f...tj->...tkj", together, together)
         alone = (self._given @ p.private).unflatten(-2, (-1, self.noise.frames))
         within = torch.einsum("...bktq,...bjtq->...btkj", alone, alone)
@@ -223,4 +223,4 @@ class GivenEntries:
 def joined(p: Population) -> Population:
     """The same distribution, with all channels as one."""
     private = torch.block_diag(*p.private)
-    return Population(p.mean.flatten()[None], p.factors.flatten(0, 1)[None], private[None])
+    return Population(p.mean.flatten()[None], p.loadings.flatten(0, 1)[None], private[None])
