@@ -184,7 +184,7 @@ def test_evidence_of_every_timing_is_the_density_of_the_dense_gaussian(hidden):
             mean[s], (covariance + torch.diag(noise))[s][:, s]
         )
         given = model._given([timing])
-        (group,) = given.groups(x, seen.expand_as(x))
+        (group,) = given.observed_alike(x, seen.expand_as(x))
         expected = law.log_prob(x.mT.flatten(1)[:, s])
         torch.testing.assert_close(given.evidence(group)[0, 0], expected, rtol=1e-9, atol=1e-7)
 

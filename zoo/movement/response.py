@@ -20,8 +20,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 __all__ = [
+    "ALPHA_FRAME",
     "Response",
     "Transformation",
+    "critical_system",
     "discrete_basis",
     "impulse_response",
     "input_vector",
@@ -31,6 +33,7 @@ __all__ = [
 ]
 
 DECAY = math.log(100.0)
+ALPHA, ALPHA_FRAME = 25.0, 0.4
 WIDTH = 0.55
 DENSE = 300
 BLOCK = 32
@@ -66,6 +69,21 @@ class Transformation:
     def stable(self) -> bool:
         """Whether semi-implicit Euler steps of this length converge to the goal."""
         return bool(torch.linalg.eigvals(transition_matrix(self)).abs().max() < 1)
+
+
+def critical_system(alpha: float | None, frames: int) -> Transformation:
+    """The critically damped system, β = α/4, a movement of ``frames`` frames long in its unit.
+
+    None for α is 25, or 0.4 a frame for movements under 64 frames: more makes Euler steps unstable.
+    """
+    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
+    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
+    if not system.stable:
+        raise ValueError(
+            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
+            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
+        )
+    return system
 
 
 def transition_matrix(system: Transformation) -> Float[Tensor, "2 2"]:

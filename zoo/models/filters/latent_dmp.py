@@ -15,7 +15,7 @@ from zoo.contract.settings import Count, Positive, settings
 from zoo.movement.lengths import common_length
 from zoo.movement.plan import Latents, Plan
 from zoo.movement.response import (
-    Transformation,
+    critical_system,
     discrete_basis,
     input_vector,
     transition_matrix,
@@ -27,7 +27,6 @@ from zoo.types import Layout
 
 __all__ = ["Config", "LatentDmp"]
 
-ALPHA, ALPHA_FRAME = 25.0, 0.4
 BEYOND = 0.1
 
 
@@ -95,7 +94,7 @@ class LatentDmp(nn.Module):
         self.latent_dim, self.kernels = config.latent_dim, config.kernels
         self.goal_scaling = config.goal_scaling
         channels, latent = len(layout.channels), config.latent_dim
-        self.system = _system(config.alpha, self.frames)
+        self.system = critical_system(config.alpha, self.frames)
         self.decoder = mlp([latent, config.hidden, channels], config.activation)
         self.g = mlp([latent, config.transition_hidden, latent], "tanh")
         nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
@@ -175,15 +174,3 @@ class LatentDmp(nn.Module):
         time = torch.arange(steps, dtype=torch.float64)
         whole = (self.frames - 1) * duration
         return discrete_basis(time, kernels=self.kernels, duration=whole)
-
-
-def _system(alpha: float | None, frames: int) -> Transformation:
-    """The critically damped system, a movement long in its unit of time."""
-    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
-    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
-    if not system.stable:
-        raise ValueError(
-            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
-            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
-        )
-    return system

@@ -18,12 +18,11 @@ from zoo.datasets.records import Sequences
 from zoo.errors import NotFittedError
 from zoo.models.filters import latent_dmp
 from zoo.models.filters.cycles import CyclePrior
-from zoo.models.filters.latent_dmp import ALPHA_FRAME
 from zoo.models.filters.latent_path_prior import PRIOR_DRAWS
 from zoo.models.filters.vae_dmp import VaeDmp
 from zoo.movement.demonstrations import extremes, seen_entries
 from zoo.movement.plan import Latents, Plan
-from zoo.movement.response import Response, rhythmic_basis
+from zoo.movement.response import ALPHA_FRAME, Response, rhythmic_basis
 from zoo.movement.timing import period_of, tempos
 from zoo.types import Batch, Layout, Posterior
 

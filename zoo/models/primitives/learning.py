@@ -14,7 +14,7 @@ from zoo.models.primitives.alignment import anchors_of, primitive_timings
 from zoo.models.primitives.communality import blocks, unshared
 from zoo.models.primitives.conjugate_regression import FLOOR, conjugate_weights
 from zoo.models.primitives.population import ParameterShrinkage, Population, estimate
-from zoo.models.primitives.rollout import Primitive, roll_out
+from zoo.models.primitives.rollout import Primitive, kernel_values, roll_out
 from zoo.models.primitives.scales import student_scales
 from zoo.models.primitives.sufficient_statistics import Sums, of_weights, square_after, sums_of
 from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
@@ -136,11 +136,11 @@ def _local_weights(
     primitive: Primitive, movements: Movements, timings: list[Timing], starts: Tensor
 ) -> tuple[Tensor, Tensor]:
     """θ of every movement by (61), which has no posterior covariance."""
-    rows = []
+    rows, kind, count = [], primitive.kind, primitive.kernels
     for (x, seen), timing, start in zip(movements, timings, starts, strict=True):
         _, target = target_force(x, start[:, 2], primitive.system(timing))
         usable = target_known(seen.mT).mT
-        kernels = primitive.kernel_values(len(x), timing, normalised=False)[:-1]
+        kernels = kernel_values(kind, count, len(x), timing, normalised=False)[:-1]
         gate = primitive.gate(len(x), timing)[:-1]
         rows.append(locally_weighted_regression(kernels, target, scale=gate, mask=usable).T)
     parameters = torch.cat([starts, torch.stack(rows)], dim=2)

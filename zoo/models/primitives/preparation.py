@@ -12,10 +12,10 @@ from torch import Tensor
 
 from zoo.models.primitives.alignment import basis_timings
 from zoo.models.primitives.cross_fitting import Prepared
+from zoo.models.primitives.rollout import kernel_values
 from zoo.models.primitives.synergies import synergies_of
 from zoo.models.primitives.weight_learning import Single, similarity, views_of
 from zoo.models.primitives.weights import Basis
-from zoo.movement.response import discrete_basis, rhythmic_basis
 from zoo.movement.timing import Expected, Kind, Movements, Timing, duration, period_of, phases
 
 __all__ = ["Preparation"]
@@ -37,12 +37,7 @@ class Preparation:
         self, synergies: Float[Tensor, "channel synergy"], frames: int, timing: Timing
     ) -> Basis:
         """φ and S of ``frames`` frames."""
-        time = torch.arange(frames, dtype=synergies.dtype)
-        if self.kind == "discrete":
-            φ = discrete_basis(time, kernels=self.kernels, duration=timing.unit)
-        else:
-            φ = rhythmic_basis(time, kernels=self.kernels, period=timing.unit, offset=timing.offset)
-        return Basis(φ, synergies)
+        return Basis(kernel_values(self.kind, self.kernels, frames, timing), synergies)
 
     def of(self, movements: Movements, rate: float | None, rows: Sequence[int]) -> Prepared:
         """Some of the movements; nothing of the others is used."""
