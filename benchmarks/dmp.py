@@ -8,7 +8,6 @@ kept responses were dropped; the harness' share is what the model itself does no
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -20,15 +19,15 @@ from torch import Tensor
 
 import zoo
 from benchmarks.harness import Timings, interleave, ratio, report, store
+from benchmarks.peer_primitive import design, imitated
 from zoo.inference.loader import whole
-from zoo.movement import kalman, rollout
-from zoo.movement import sufficient_statistics as sums
-from zoo.movement.forcing import fit_matrix, trajectory_matrix
-from zoo.movement.response import Response, Transformation, discrete_basis, phase
+from zoo.models.primitives import kalman, rollout
+from zoo.models.primitives import sufficient_statistics as sums
+from zoo.movement.forcing import trajectory_matrix
+from zoo.movement.response import Response, Transformation
 
 JOINTS, STEPS, KERNELS = 50, 1000, 20
 MANY = 100
-OVERLAP = 1 / math.sqrt(-2 * math.log(0.8))
 BACKENDS = ("rk4-cython", "euler-cython")
 PEER = "movement-primitives"
 
@@ -110,21 +109,14 @@ def shares(timings: Timings, slow: str, fast: str, count: int) -> dict[str, floa
     }
 
 
-def design(kernels: int) -> Tensor:
-    """s Ψ/ΣΨ of every frame, with the peer's widths."""
-    time = torch.arange(STEPS, dtype=torch.float64)
-    basis = discrete_basis(time, kernels=kernels, duration=STEPS - 1, spread=OVERLAP)
-    return basis * phase(time, duration=STEPS - 1)[:, None]
-
-
 def agreement(kernels: int = KERNELS) -> dict[str, float]:
     """Largest differences: same movement → same weights, same weights → same movement."""
     x = movement()
     system = Transformation(alpha=25.0, beta=6.25, tau=1.0, dt=1 / (STEPS - 1))
     dmp = peer(x, kernels)
     weights = torch.from_numpy(dmp.forcing_term.weights_.T.copy())
-    own = fit_matrix(design(kernels), system) @ x
-    matrix = trajectory_matrix(Response.of(system, STEPS), design(kernels)[1:])
+    own = imitated(x, kernels, system)
+    matrix = trajectory_matrix(Response.of(system, STEPS), design(kernels, STEPS)[1:])
     path = matrix @ torch.cat([x[:1], torch.zeros_like(x[:1]), x[-1:], own])
     theirs = torch.from_numpy(dmp.open_loop(step_function="euler-cython")[1][:STEPS])
     return {

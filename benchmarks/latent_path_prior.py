@@ -84,8 +84,8 @@ class OwnPrior(VaeDmp):
         gain = self.w_noise.detach().double()
         dense += torch.einsum("ts,ij->tisj", noise @ noise.mT, gain.mT @ gain)
         path = (φ @ mean)[None]
-        still = torch.zeros_like(path)
-        return OwnPaths(path, mixture.spread, still, mixture.observation, 0.0, dense=dense)
+        known = mixture.independent, torch.zeros_like(path), mixture.observation
+        return OwnPaths(path, *known, bandwidth=0.0, dense=dense)
 
     def _moments(self) -> tuple[Tensor, Tensor]:
         """Mean and variance of w, goal, first position and velocity, in the space of z*."""

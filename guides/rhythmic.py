@@ -12,8 +12,8 @@ from torch import Tensor
 
 from zoo.datasets.records import Sequences
 from zoo.guides.filtering import Config, FilteringGuide, LatentDynamics, normal
+from zoo.guides.template import ROWS, learn_template, match
 from zoo.movement.plan import Plan
-from zoo.movement.template import ROWS, learn_template, match
 from zoo.types import Batch, Layout
 
 __all__ = ["Config", "RhythmicDynamics", "RhythmicGuide"]
@@ -35,7 +35,7 @@ class RhythmicGuide(FilteringGuide):
     """As :class:`~zoo.guides.filtering.FilteringGuide`, with phase and tempo of every movement.
 
     Both are points: where a template of one period, learned from the training movements before all
-    else, is nearest to the movement (:mod:`zoo.movement.template`). w is (88) of frames folded onto
+    else, is nearest to the movement (:mod:`zoo.guides.template`). w is (88) of frames folded onto
     the circle, g_2(Σ_t Ψ_k(s_t) g_1(x_t) / Σ_t Ψ_k(s_t)), so that neither where a movement begins
     nor how fast it is matters; the centre is encoded from the mean of the frames' encodings.
     """

@@ -56,7 +56,7 @@ from zoo.errors import PosteriorCollapseWarning
 from zoo.evaluation.figures.bands import reliability
 from zoo.evaluation.figures.postures import posture_map, posture_strips
 from zoo.faces.screening import screen_run
-from zoo.movement.template import match
+from zoo.guides.template import match
 from zoo.nn.metric import sensitivity
 from zoo.studies import stored
 

@@ -207,4 +207,4 @@ def test_a_population_is_conditioned_on_each_movement_by_itself() -> None:
     for i in range(5):
         alone = prior.condition(precision[i], linear[i : i + 1])
         torch.testing.assert_close(together.mean[i : i + 1], alone.mean)
-        torch.testing.assert_close(together.factors[i], alone.factors)
+        torch.testing.assert_close(together.loadings[i], alone.loadings)

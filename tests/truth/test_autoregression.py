@@ -17,7 +17,7 @@ import zoo
 from zoo.datasets.records import Sequences
 from zoo.inference.loader import whole
 from zoo.models.baselines.autoregression import Autoregression, Config
-from zoo.models.baselines.chain_selection import RIDGES, Choice
+from zoo.models.baselines.chain_selection import RIDGES, ChainSettings
 from zoo.models.baselines.chains import Chain, lags_up_to
 from zoo.types import Batch
 
@@ -166,10 +166,10 @@ def test_the_choice_has_the_least_error_of_held_out_forecasts() -> None:
                         ahead = rolled(beta, lags_up_to(order), a[:k], len(a) - k)
                         square += float(((ahead - a[k:]) ** 2).sum())
                         count += ahead.size
-            score[Choice(order, True, ridge)] = square / count
+            score[ChainSettings(order, True, ridge)] = square / count
     model = Autoregression(data.layout, Config(coupling="vector"))
-    trials = model._trials(data)
-    assert trials.chosen(list(score)) == min(score, key=lambda c: score[c])
+    held_out = model._held_out(data)
+    assert held_out.chosen(list(score)) == min(score, key=lambda c: score[c])
     model.condition(data)
     assert model.lags.tolist() == [1, 2]
 
@@ -309,7 +309,7 @@ def test_wide_data_have_a_short_memory() -> None:
     values = list(np.random.default_rng(0).normal(size=(3, 12, 600)))
     data = Sequences.from_arrays(values, rate=30.0)
     model = Autoregression(data.layout, Config(ridge=1.0))
-    found = model._choices(model._trials(data), data.channels)
+    found = model._choices(model._held_out(data), data.channels)
     assert {choice.order for choice in found} == {1, 2}
 
 

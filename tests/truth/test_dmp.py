@@ -12,26 +12,24 @@ import torch
 from pyro import poutine
 
 import zoo
+from benchmarks.peer_primitive import design, imitated
 from zoo.datasets.records import Sequences
 from zoo.errors import ExtrapolationWarning, NotFittedError
 from zoo.guides.exact import Config as ExactConfig
 from zoo.guides.exact import ExactPosterior
 from zoo.inference.loader import whole
 from zoo.models.primitives.dmp import DMP, Config
+from zoo.models.primitives.kalman import PathNoise
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import roll_out
 from zoo.movement.forcing import (
-    central_target_force,
-    fit_matrix,
     locally_weighted_regression,
-    ridge_regression,
     stationary_variance,
     target_force,
     trajectory_matrix,
 )
-from zoo.movement.kalman import PathNoise
 from zoo.movement.response import Response, Transformation, discrete_basis, phase
-from zoo.movement.rollout import Timing, roll_out
-from zoo.movement.timing import period_of
+from zoo.movement.timing import Timing, period_of
 from zoo.prediction import mixtures
 from zoo.streams import seeded
 from zoo.types import Wishes
@@ -68,27 +66,16 @@ def test_locally_weighted_regression_is_weighted_least_squares():
             assert float(found[i, c]) == pytest.approx(float(solution[0]), rel=1e-9)
 
 
-def test_fit_matrix_is_the_ridge_regression_of_the_target_force():
-    x = movement()
-    design = discrete_basis(torch.arange(60, dtype=torch.float64), kernels=8, duration=59)
-    expected = ridge_regression(design, central_target_force(x, x[-1], SYSTEM), 0.1)
-    torch.testing.assert_close(fit_matrix(design, SYSTEM, 0.1) @ x, expected, rtol=1e-9, atol=1e-9)
-
-
 def test_weights_and_movement_equal_those_of_movement_primitives():
     peers = pytest.importorskip("movement_primitives.dmp", reason="extra bench is not installed")
     x, frames = movement(frames=200), 200
     peer = peers.DMP(3, execution_time=1.0, dt=1 / 199, int_dt=1 / 199, n_weights_per_dim=12)
     peer.imitate(np.linspace(0, 1, frames), x.numpy())
-    time = torch.arange(frames, dtype=torch.float64)
-    spread = 1 / math.sqrt(-2 * math.log(0.8))
-    basis = discrete_basis(time, kernels=12, duration=199, spread=spread)
-    design = basis * phase(time, duration=199)[:, None]
     system = Transformation(dt=1 / 199)
-    weights = ridge_regression(design, central_target_force(x, x[-1], system))
+    weights = imitated(x, 12, system)
     theirs = torch.from_numpy(peer.forcing_term.weights_.T)
     torch.testing.assert_close(weights, theirs, rtol=1e-8, atol=1e-8 * float(theirs.abs().max()))
-    matrix = trajectory_matrix(Response.of(system, frames), design[1:])
+    matrix = trajectory_matrix(Response.of(system, frames), design(12, frames)[1:])
     path = matrix @ torch.cat([x[:1], torch.zeros_like(x[:1]), x[-1:], theirs])
     expected = torch.from_numpy(peer.open_loop(step_function="euler")[1][:frames])
     torch.testing.assert_close(path, expected, rtol=0, atol=1e-8)
@@ -111,7 +98,7 @@ def random_population(channels=CHANNELS, parameters=4, factors=2):
 
 def dense(population):
     """Mean and covariance of the channels' parameters in one vector."""
-    shared = population.factors.flatten(0, 1)
+    shared = population.loadings.flatten(0, 1)
     alone = torch.block_diag(*(v @ v.T for v in population.private))
     return population.mean.flatten(), shared @ shared.T + alone
 
@@ -128,7 +115,7 @@ def test_population_is_a_dense_gaussian():
     found = population.condition(precision, linear)
     expected = torch.linalg.solve(total, right.T).T
     torch.testing.assert_close(found.mean.flatten(1), expected, rtol=1e-8, atol=1e-8)
-    one = Population(found.mean[0], found.factors, found.private)
+    one = Population(found.mean[0], found.loadings, found.private)
     torch.testing.assert_close(dense(one)[1], torch.linalg.inv(total), rtol=1e-8, atol=1e-8)
     evidence = (
         (right * expected).sum(1) - mean @ information @ mean - torch.logdet(total @ covariance)
@@ -197,7 +184,7 @@ def test_evidence_of_every_timing_is_the_density_of_the_dense_gaussian(hidden):
             mean[s], (covariance + torch.diag(noise))[s][:, s]
         )
         given = model._given([timing])
-        (group,) = given.groups(x, seen.expand_as(x))
+        (group,) = given.observed_alike(x, seen.expand_as(x))
         expected = law.log_prob(x.mT.flatten(1)[:, s])
         torch.testing.assert_close(given.evidence(group)[0, 0], expected, rtol=1e-9, atol=1e-7)
 
@@ -253,7 +240,7 @@ def test_guide_is_the_posterior_of_the_program_at_every_draw(make, information):
     seen = torch.rand(batch.values.shape, generator=torch.Generator().manual_seed(1)) < 0.8
     batch = replace(batch, movements=batch.movements * seen, movement_mask=seen)
     guide = ExactPosterior(data.layout, model, ExactConfig())
-    timings = model._whole(batch.movements.shape[1])
+    timings = model.expected.whole(batch.movements.shape[1])
     pairs = zip(batch.movements, seen, strict=True)
     expected = sum(evidence(model, timings, x, s) for x, s in pairs)
     for seed in range(4):

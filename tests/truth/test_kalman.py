@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from zoo.movement.kalman import PathNoise, Smoother
+from zoo.models.primitives.kalman import PathNoise, Smoother
 from zoo.movement.response import Transformation
 
 RATIOS = torch.tensor([[0.01], [1.0], [100.0]], dtype=torch.float64)

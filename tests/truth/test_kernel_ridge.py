@@ -14,7 +14,7 @@ from zoo.datasets.records import Sequences
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
 from zoo.models.baselines.kernel_ridge import Config, KernelRidge, Pattern
-from zoo.models.baselines.ridge_regression import Kernel, Problem, left_out_squares, predicted
+from zoo.models.baselines.ridge_regression import Kernel, Problem, held_out_squares, predicted
 
 KERNEL = Kernel(1.5, 0.05)
 
@@ -53,7 +53,7 @@ def test_errors_of_groups_left_out_are_those_of_refitting():
         square += (centred[out] - torch.from_numpy(found)).square().sum(0)
     spread = predicted(KERNEL, p, p.inputs[:1])[1]
     torch.testing.assert_close(spread, (square / 24).sqrt(), rtol=1e-9, atol=0)
-    torch.testing.assert_close(left_out_squares(p, [KERNEL])[0], square, rtol=1e-8, atol=0)
+    torch.testing.assert_close(held_out_squares(p, [KERNEL])[0], square, rtol=1e-8, atol=0)
 
 
 def test_agrees_with_scikit_learn():

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import zoo
 from zoo.datasets.records import Sequences
 from zoo.inference.loader import whole
-from zoo.models.baselines.analogue_selection import Options, Trials
+from zoo.models.baselines.analogue_selection import HeldOutAnalogues, Options
 from zoo.models.baselines.gaps import Gaps
 from zoo.models.baselines.nearest_neighbour import Config, NearestNeighbour
 from zoo.models.baselines.re_entry import Library
@@ -128,7 +128,7 @@ def test_the_choice_has_the_least_held_out_error() -> None:
                     total += float(((near.mean(0) - a[k:]) ** 2).sum())
         score[context, n, align, again] = total
     model = fitted(data)
-    chosen = Trials(model.library, torch.arange(6) % 4).chosen(options)
+    chosen = HeldOutAnalogues(model.library, torch.arange(6) % 4).chosen(options)
     assert tuple(vars(chosen).values()) == min(score, key=lambda one: score[one])
     assert chosen.re_enter
 
@@ -230,9 +230,9 @@ def test_leaving_out_groups_widens_the_bands_of_a_group_that_repeats_itself() ->
     groups = {"trial": range(8), "subject": [i // 2 for i in range(8)]}
     data = Sequences.from_arrays(arrays, rate=30.0, groups=groups)
     settings = {"neighbours": 1, "context": 5, "align": "last", "re_enter": False}
-    trial = fitted(data, **settings)
+    asked_of = fitted(data, **settings)
     subject = fitted(data, leave_out="subject", **settings)
-    assert bool((subject.noise[-1, :10] > 5 * trial.noise[-1, :10]).all())
+    assert bool((subject.noise[-1, :10] > 5 * asked_of.noise[-1, :10]).all())
 
 
 @real

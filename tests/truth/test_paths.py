@@ -6,7 +6,7 @@ import torch
 from laws import check_uniform
 from torch import Tensor
 
-from zoo.movement.cycles import CyclePrior
+from zoo.models.filters.cycles import CyclePrior
 from zoo.movement.gaussian_paths import stationary
 from zoo.movement.paths import PathPrior
 

@@ -63,7 +63,7 @@ def hidden(kind: str | None) -> torch.Tensor:
 def steps(model: PcaDmp) -> tuple[np.ndarray, np.ndarray]:
     """Paths of unit parameters and of unit forces of a component, frame by frame."""
     α, β, dt = 25.0, 25.0 / 4, 1 / (FRAMES - 1)
-    kernels = model.dmp.primitive.basis(FRAMES, model.dmp._whole(FRAMES)[0])[:-1].numpy()
+    kernels = model.dmp.primitive.basis(FRAMES, model.dmp.expected.whole(FRAMES)[0])[:-1].numpy()
     size = 3 + KERNELS
 
     def roll(y: float, velocity: float, goal: float, force: np.ndarray) -> list[float]:

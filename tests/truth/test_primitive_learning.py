@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Literal
 
 import pytest
 import torch
+from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from zoo.movement.conjugate_regression import conjugate_weights
-from zoo.movement.rollout import Primitive, Timing
-from zoo.movement.timing import anchors
+from zoo.models.primitives.alignment import anchors
+from zoo.models.primitives.conjugate_regression import conjugate_weights
+from zoo.models.primitives.rollout import Primitive
+from zoo.movement.timing import Timing
 
 
 @pytest.mark.parametrize("kind", ["discrete", "rhythmic"])
@@ -26,22 +29,25 @@ def test_the_goal_is_the_last_observed_frame_or_the_mean_of_a_rhythm(
     torch.testing.assert_close(found, expected)
 
 
-def test_the_evidence_of_weights_is_the_density_of_the_dense_gaussian() -> None:
+def test_the_variances_of_weights_have_the_highest_density_of_the_dense_gaussian() -> None:
     generator = torch.Generator().manual_seed(0)
     frames, kernels, sequences = 12, 3, 4
     design = torch.randn(frames, kernels, generator=generator).double()
     w = torch.randn(sequences, 2, kernels, generator=generator).double()
     noise = torch.randn(sequences, 2, frames, generator=generator).double()
-    x = w @ design.T + 0.3 * noise
-    found = conjugate_weights(
-        (design.T @ design)[None, None],
-        x @ design,
-        x.square().sum(-1),
-        torch.full((sequences, 1), float(frames)).double(),
-        torch.zeros(sequences, 1).double(),
-    )
-    for c in range(2):
-        covariance = found.prior[c] * design @ design.T
-        covariance = covariance + found.noise[c] * torch.eye(frames).double()
+    x, gram = w @ design.T + 0.3 * noise, design.T @ design
+    count = torch.full((sequences, 1), float(frames)).double()
+    found = conjugate_weights(gram[None, None], x @ design, x.square().sum(-1), count)
+    ratio = (found.covariance[0].inverse() - gram).diagonal(dim1=-2, dim2=-1).mean(-1)
+
+    def density(c: int, σ2: Tensor, λ: Tensor) -> float:
+        covariance = σ2 * (design @ design.T / λ + torch.eye(frames).double())
         law = MultivariateNormal(torch.zeros(frames).double(), covariance)
-        torch.testing.assert_close(found.log_evidence[c], law.log_prob(x[:, c]).sum())
+        return float(law.log_prob(x[:, c]).sum())
+
+    for c in range(2):
+        σ2, λ = found.noise[c], ratio[c]
+        others = [density(c, σ2 * f, λ * g) for f, g in product((0.8, 1, 1.25), (0.6, 1, 1.6))]
+        assert density(c, σ2, λ) == max(others)
+        mean = torch.linalg.solve(gram + λ * torch.eye(kernels).double(), (x @ design)[:, c].T)
+        torch.testing.assert_close(found.mean[:, c], mean.T)

@@ -14,9 +14,15 @@ from zoo.datasets.records import Sequences
 from zoo.errors import NotFittedError
 from zoo.inference.loader import whole
 from zoo.models.primitives.promp import Config, ProMP
-from zoo.models.primitives.weight_learning import Noise, Single, learn, similarity, views_of
+from zoo.models.primitives.weight_learning import (
+    EntryNoise,
+    Single,
+    learn_weights,
+    similarity,
+    views_of,
+)
 from zoo.models.primitives.weights import Basis, Weights
-from zoo.movement.rollout import Timing
+from zoo.movement.timing import Timing
 from zoo.streams import seeded
 from zoo.types import Wishes
 
@@ -111,7 +117,7 @@ def test_log_density_is_that_of_the_dense_gaussian():
         expected = torch.distributions.MultivariateNormal(
             mean[known], (path + noise)[known][:, known]
         ).log_prob(data.values[i].flatten()[known])
-        found = view.log_density(model.weights, Noise(model.noise.square()))
+        found = view.log_density(model.weights, EntryNoise(model.noise.square()))
         torch.testing.assert_close(found[0, 0], expected, rtol=1e-9, atol=1e-9)
 
 
@@ -150,7 +156,7 @@ def test_expectation_maximisation_never_loses():
     inside = [(x[:n], seen[:n]) for x, seen, n in rows]
     views = views_of(model.basis, inside, [Timing(len(x) - 1.0) for x, _ in inside])
     single = Single.of(views, similarity(KERNELS, circular=False))
-    found = learn(single, views, 0.2, iterations=15, tolerance=0.0)
+    found = learn_weights(single, views, 0.2, iterations=15, tolerance=0.0)
     gains = np.diff(found.objective)
     assert len(gains) >= 5 and gains.min() > -1e-7 * abs(found.objective[-1])
 

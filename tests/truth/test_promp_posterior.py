@@ -21,7 +21,7 @@ from zoo.models.primitives.cross_fitting import choose
 from zoo.models.primitives.preparation import Preparation
 from zoo.models.primitives.promp import Config, ProMP
 from zoo.models.primitives.scales import student_scales
-from zoo.movement.rollout import Timing
+from zoo.movement.timing import Timing
 from zoo.prediction.mixtures import cdf
 from zoo.streams import seeded
 from zoo.types import Wishes
@@ -215,8 +215,8 @@ def test_nothing_of_a_movement_left_out_is_used_before_it_is_judged(
         left.append(next(i for i, (x, _) in enumerate(movements) if x is values))
         return find(prepared, values, seen)
 
-    find = cross_fitting._left
-    monkeypatch.setattr(cross_fitting, "_left", judged)
+    find = cross_fitting._held_out
+    monkeypatch.setattr(cross_fitting, "_held_out", judged)
     group = torch.tensor([0, 0, 1, 1, 2, 2])
     choose(prepare, movements, group, None, None)
     assert sorted(asked) == [(0, 1, 2, 3), (0, 1, 4, 5), (2, 3, 4, 5)]

@@ -15,14 +15,14 @@ import zoo
 from zoo.datasets.records import Sequences
 from zoo.guides.filtering import Config as GuideConfig
 from zoo.guides.rhythmic import RhythmicGuide
+from zoo.guides.template import fourier, learn_template, match
 from zoo.inference.loader import Loader, whole
 from zoo.inference.posterior import GuidePosterior
+from zoo.models.filters.cycles import CyclePrior
 from zoo.models.filters.vae_dmp_rhythmic import Config, RhythmicVaeDmp
-from zoo.movement.cycles import CyclePrior
 from zoo.movement.gaussian_paths import stationary, stationary_draws
 from zoo.movement.paths import Readout
 from zoo.movement.plan import Plan
-from zoo.movement.template import fourier, learn_template, match
 
 PERIOD, FRAMES, CHANNELS = 40.0, 90, 6
 

@@ -9,7 +9,7 @@ from scipy import stats
 
 import zoo
 from zoo.datasets.records import Sequences
-from zoo.models.primitives.population import Shares, estimate
+from zoo.models.primitives.population import ParameterShrinkage, estimate
 from zoo.movement.response import discrete_basis
 
 FRAMES, CHANNELS, KERNELS, MOVEMENTS, SETS = 24, 6, 5, 4, 24
@@ -47,8 +47,10 @@ def test_the_tails_of_few_movements_are_those_of_a_t() -> None:
         assert stats.norm.cdf(far / scales).mean() == pytest.approx(level, abs=0.01)
 
 
-@pytest.mark.parametrize("shares", [Shares(0.05, 0.1), Shares(0.6, 0.5)])
-def test_parameters_of_few_movements_are_as_wide_as_a_new_one_is_far(shares: Shares) -> None:
+@pytest.mark.parametrize("shares", [ParameterShrinkage(0.05, 0.1), ParameterShrinkage(0.6, 0.5)])
+def test_parameters_of_few_movements_are_as_wide_as_a_new_one_is_far(
+    shares: ParameterShrinkage,
+) -> None:
     """The same of dmp's population: its total variance over movements, whatever is shared."""
     generator, sets = torch.Generator().manual_seed(0), 200
     flat = torch.zeros(CHANNELS, KERNELS, KERNELS, dtype=torch.float64)
@@ -57,7 +59,7 @@ def test_parameters_of_few_movements_are_as_wide_as_a_new_one_is_far(shares: Sha
         shape = (MOVEMENTS, CHANNELS, KERNELS)
         θ = torch.randn(shape, generator=generator, dtype=torch.float64)
         found = estimate(θ, flat, shares, torch.zeros(KERNELS, dtype=torch.float64))
-        parts = (found.factors, found.private)
+        parts = (found.loadings, found.private)
         sizes.append(sum(float(part.square().sum(-1).mean()) for part in parts))
     error = np.sqrt(2 / (MOVEMENTS - 1) / (sets * KERNELS * CHANNELS))
     assert np.mean(sizes) == pytest.approx(1 + 1 / MOVEMENTS, abs=5 * error)

@@ -292,10 +292,10 @@ def prior(movements: int = 3, time: int = 6) -> PathPrior:
         root = torch.randn(size, size)
         return root @ root.T / size
 
-    spread = torch.stack([covariance(time) for _ in range(LATENT)])
+    independent = torch.stack([covariance(time) for _ in range(LATENT)])
     return PathPrior(
         paths=torch.randn(movements, time, LATENT),
-        spread=spread,
+        independent=independent,
         residuals=0.3 * torch.randn(movements, time, LATENT),
         observation=0.2 * covariance(LATENT) + 0.05 * torch.eye(LATENT),
         bandwidth=0.6,

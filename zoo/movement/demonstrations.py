@@ -15,7 +15,7 @@ __all__ = ["extremes", "movement_groups", "movements_of", "seen_entries", "seen_
 
 
 def movements_of(name: str, data: Sequences | Pairs, dtype: torch.dtype) -> Sequences:
-    """Training movements with 0 where nothing was seen; a channel never seen is refused by name."""
+    """Training movements with 0 where nothing was observed; a channel never observed is refused."""
     if not isinstance(data, Sequences):
         raise TypeError(f"{name} needs Sequences; got {type(data).__name__}")
     never = ~data.mask.any(1).any(0)

@@ -9,10 +9,7 @@ from torch import Tensor
 from zoo.movement.response import Response, Transformation, input_vector, transition_matrix
 
 __all__ = [
-    "central_target_force",
-    "fit_matrix",
     "locally_weighted_regression",
-    "ridge_regression",
     "stationary_variance",
     "target_force",
     "target_known",
@@ -40,8 +37,9 @@ def target_force(
     step = position.diff(dim=-2) / system.dt
     velocity = torch.cat([step[..., :1, :], step], dim=-2)
     acceleration = velocity.diff(dim=-2) / system.dt
-    before = position[..., :-1, :], velocity[..., :-1, :]
-    return velocity[..., 0, :], _force(*before, acceleration, goal, system)
+    spring = system.stiffness * (goal[..., None, :] - position[..., :-1, :])
+    damping = system.alpha * system.tau * velocity[..., :-1, :]
+    return velocity[..., 0, :], system.tau**2 * acceleration - spring + damping
 
 
 def target_known(seen: Bool[Tensor, "*batch time"]) -> Bool[Tensor, "*batch time_minus_1"]:
@@ -52,23 +50,6 @@ def target_known(seen: Bool[Tensor, "*batch time"]) -> Bool[Tensor, "*batch time
     """
     before = torch.cat([seen[..., :1], seen[..., :-2]], dim=-1)
     return before & seen[..., :-1] & seen[..., 1:]
-
-
-def central_target_force(
-    position: Float[Tensor, "*batch time channel"],
-    goal: Float[Tensor, "*batch channel"],
-    system: Transformation,
-) -> Float[Tensor, "*batch time channel"]:
-    """The force (59) of every frame by central differences; the movement ends at rest.
-
-    The convention of the package movement-primitives; smoother than :func:`target_force`, but its
-    roll-out does not quite reproduce the demonstration.
-    """
-    velocity = _central(position, system.dt)
-    velocity[..., -1, :] = 0
-    acceleration = _central(velocity, system.dt)
-    acceleration[..., -1, :] = 0
-    return _force(position, velocity, acceleration, goal, system)
 
 
 def locally_weighted_regression(
@@ -87,34 +68,6 @@ def locally_weighted_regression(
     above = (kernels * ξ[:, None]).mT @ (target * seen)
     below = (kernels * ξ[:, None].square()).mT @ seen
     return torch.where(below > 0, above / below.clamp_min(torch.finfo(below.dtype).tiny), 0.0)
-
-
-def ridge_regression(
-    design: Float[Tensor, "time kernel"],
-    target: Float[Tensor, "time channel"],
-    penalty: float = 0.0,
-) -> Float[Tensor, "kernel channel"]:
-    """Weights that minimise ‖target − design w‖² + penalty ‖w‖², all kernels at once (63)."""
-    return torch.cholesky_solve(design.mT @ target, torch.linalg.cholesky(_gram(design, penalty)))
-
-
-def fit_matrix(
-    design: Float[Tensor, "time kernel"], system: Transformation, penalty: float = 0.0
-) -> Float[Tensor, "kernel time"]:
-    """S with w = S y: ridge regression on the central target force of a movement y.
-
-    Both are linear in the demonstration, the goal is its last frame: S is the adjoint of
-    :func:`central_target_force` applied to the design. Fitting any number of movements of this
-    length is one product.
-    """
-    rate = design.clone()
-    rate[-1] = 0
-    velocity = _central_adjoint(rate, system.dt)
-    velocity[-1] = 0
-    rate = rate.mul_(system.alpha * system.tau).add_(velocity, alpha=system.tau**2)
-    pulled = system.stiffness * design + _central_adjoint(rate, system.dt)
-    pulled[-1] -= system.stiffness * design.sum(0)
-    return torch.cholesky_solve(pulled.mT, torch.linalg.cholesky(_gram(design, penalty)))
 
 
 def trajectory_matrix(
@@ -142,38 +95,3 @@ def stationary_variance(system: Transformation) -> float:
     a, b = transition_matrix(system), input_vector(system)
     eye = torch.eye(4, dtype=a.dtype)
     return float(torch.linalg.solve(eye - torch.kron(a, a), torch.outer(b, b).flatten())[0])
-
-
-def _force(
-    position: Tensor, velocity: Tensor, acceleration: Tensor, goal: Tensor, system: Transformation
-) -> Tensor:
-    spring = system.stiffness * (goal[..., None, :] - position)
-    damping = system.alpha * system.tau
-    return system.tau**2 * acceleration - spring + damping * velocity
-
-
-def _central(values: Tensor, dt: float) -> Tensor:
-    inner = (values[..., 2:, :] - values[..., :-2, :]) / (2 * dt)
-    first = (values[..., 1:2, :] - values[..., :1, :]) / dt
-    last = (values[..., -1:, :] - values[..., -2:-1, :]) / dt
-    return torch.cat([first, inner, last], dim=-2)
-
-
-def _central_adjoint(values: Tensor, dt: float) -> Tensor:
-    """The transpose of :func:`_central`."""
-    half = values[1:-1] / (2 * dt)
-    out = torch.zeros_like(values)
-    out[2:] += half
-    out[:-2] -= half
-    out[0] -= values[0] / dt
-    out[1] += values[0] / dt
-    out[-2] -= values[-1] / dt
-    out[-1] += values[-1] / dt
-    return out
-
-
-def _gram(design: Tensor, penalty: float) -> Tensor:
-    gram = design.mT @ design
-    if not penalty:
-        return gram
-    return gram + penalty * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)

@@ -1,11 +1,11 @@
-"""Gaussian mixtures over whole latent paths, and their exact conditioning on the frames seen."""
+"""Gaussian mixtures over whole latent paths, conditioned exactly on the frames observed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import ClassVar, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,35 +14,32 @@ from torch.nn.functional import pad
 
 from zoo.movement.components import alike
 from zoo.movement.gaussian_paths import block_diagonal, cholesky, stationary
+from zoo.movement.kernel_mixture import KernelMixture
 
 __all__ = ["Conditioned", "PathPrior", "Readout"]
 
-CHOICES = {
-    "bandwidth": (0.1, 0.3, 0.6, 0.8, 1.0),
-    "shrinkage": (0.01, 0.1, 0.5),
-    "process": (0.03, 0.3, 1.0),
-}
-LEFT_OUT = 8
-
 
 @dataclass(frozen=True)
-class PathPrior:
+class PathPrior(KernelMixture):
     r"""A mixture over paths z_{1:T} with a component around every known movement.
 
     p(z) = 1/M Σ_i N(z̄ + √(1−h²)(z_i − z̄), h² ((1−λ) S + λ R) + ν N): S is the covariance of the
     known paths z_i, R that of independent parameters pushed through the same linear response, N
-    that of the stationary ``residuals`` which the response leaves (West 1993). h = 1 is one
-    Gaussian, a small h a kernel estimate that stays near the movements known. Observed frames are
+    that of the stationary ``residuals`` which the response leaves. Observed frames are
     y_t ~ N(z_t, E).
     """
 
     paths: Float[Tensor, "movement time latent"]
-    spread: Float[Tensor, "latent time time"]
+    independent: Float[Tensor, "latent time time"]
     residuals: Float[Tensor, "movement time latent"]
     observation: Float[Tensor, "latent latent"]
-    bandwidth: float = 0.3
-    shrinkage: float = 0.1
-    process: float = 1.0
+
+    grids: ClassVar[Mapping[str, Sequence[float]]] = {
+        "bandwidth": (0.1, 0.3, 0.6, 0.8, 1.0),
+        "shrinkage": (0.01, 0.1, 0.5),
+        "process": (0.03, 0.3, 1.0),
+    }
+    judged: ClassVar[int] = 8
 
     @classmethod
     def of_responses(
@@ -55,30 +52,22 @@ class PathPrior:
         shape: Sequence[float] = (),
     ) -> Self:
         """The mixture around linear responses; ``shape`` is h, λ and ν where these are known."""
-        return cls(
-            response @ parameters + residuals,
-            torch.einsum("tk,kd,sk->dts", response, variance, response),
-            residuals,
-            observation,
-            *shape,
-        )
-
-    @property
-    def shape(self) -> tuple[float, float, float]:
-        """h, λ and ν."""
-        return self.bandwidth, self.shrinkage, self.process
+        independent = torch.einsum("tk,kd,sk->dts", response, variance, response)
+        prior = cls(response @ parameters + residuals, independent, residuals, observation)
+        return prior.shaped(shape)
 
     @property
     def means(self) -> Float[Tensor, "movement time latent"]:
         """Means of the components."""
-        centre = self.paths.mean(0)
-        return centre + math.sqrt(1 - self.bandwidth**2) * (self.paths - centre)
+        return self.centred(self.paths)
 
     @property
     def covariance(self) -> Float[Tensor, "time latent time latent"]:
         """Covariance that all components share."""
         movements = len(self.paths)
-        shared = self.shrinkage * torch.einsum("its,ij->tisj", self.spread, _eye(self.observation))
+        shared = self.shrinkage * torch.einsum(
+            "its,ij->tisj", self.independent, _eye(self.observation)
+        )
         if movements > 1:
             apart = (self.paths - self.paths.mean(0)) / math.sqrt(movements - 1)
             shared = shared + (1 - self.shrinkage) * torch.einsum("mti,msj->tisj", apart, apart)
@@ -125,40 +114,17 @@ class PathPrior:
             paths[:, rows] = self.condition(values[rows], frames).sample(draws).to(seen)
         return paths
 
-    def tuned(
-        self, seen: Sequence[int], readout: Readout, without: Callable[[int], PathPrior]
-    ) -> Self:
-        """The h, λ and ν with the best density of each movement's future, left out.
+    def tuned(self, seen: Sequence[int], readout: Readout, without: Callable[[int], Self]) -> Self:
+        """The h, λ and ν with the best density of held-out futures, after ``seen`` frames each.
 
-        ``without`` gives the prior of all movements but one. The future is every frame after the
-        first ``seen`` ones, judged frame by frame and channel by channel; the three are chosen in
-        turn. Fewer than three movements leave too little to compare: the defaults stay.
+        Exact densities, frame by frame and channel by channel, are read out along the path.
         """
-        if len(self.paths) < 3:
-            return self
-        rows = torch.linspace(0, len(self.paths) - 1, min(len(self.paths), LEFT_OUT)).round()
-        best, others = self, {i: without(i) for i in rows.long().tolist()}
-        for name in (*CHOICES, "bandwidth"):
-            options = [best._with(name, value) for value in CHOICES[name]]
-            best = max(options, key=lambda prior: prior.left_out(seen, readout, others))
-        return best
+        time = torch.arange(self.paths.shape[1])
 
-    def _with(self, name: str, value: float) -> Self:
-        change: dict[str, Any] = {name: value}
-        return replace(self, **change)
+        def density(rest: PathPrior, i: int, k: int) -> Tensor:
+            return rest.condition(self.paths[i], time < k).log_density(self.paths[i], readout.of(i))
 
-    def left_out(
-        self, seen: Sequence[int], readout: Readout, others: Mapping[int, PathPrior]
-    ) -> float:
-        """Mean log density of movements' futures under the others, of the same h, λ and ν."""
-        h, λ, ν = self.shape
-        total = 0.0
-        for i, rest in others.items():
-            prior = replace(rest, bandwidth=h, shrinkage=λ, process=ν)
-            for k in seen:
-                given = prior.condition(self.paths[i], torch.arange(self.paths.shape[1]) < k)
-                total += float(given.log_density(self.paths[i], readout.of(i))[k:].mean())
-        return total / (len(others) * len(seen))
+        return self.tuned_on(len(self.paths), seen, without, density)
 
 
 @dataclass(frozen=True)
@@ -184,7 +150,7 @@ class Readout:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A mixture over paths after frames were seen; all components share the covariance.
+    """A mixture over paths after frames were observed; all components share the covariance.
 
     That is the ``prior``'s less what is ``known``, knownᵀ known.
     """

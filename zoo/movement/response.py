@@ -20,19 +20,21 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 __all__ = [
+    "ALPHA_FRAME",
     "Response",
     "Transformation",
+    "critical_system",
     "discrete_basis",
     "impulse_response",
     "input_vector",
     "phase",
     "rhythmic_basis",
-    "runge_kutta",
     "transition_matrix",
 ]
 
 DECAY = math.log(100.0)
-SPREAD = 0.55
+ALPHA, ALPHA_FRAME = 25.0, 0.4
+WIDTH = 0.55
 DENSE = 300
 BLOCK = 32
 
@@ -69,6 +71,21 @@ class Transformation:
         return bool(torch.linalg.eigvals(transition_matrix(self)).abs().max() < 1)
 
 
+def critical_system(alpha: float | None, frames: int) -> Transformation:
+    """The critically damped system, β = α/4, a movement of ``frames`` frames long in its unit.
+
+    None for α is 25, or 0.4 a frame for movements under 64 frames: more makes Euler steps unstable.
+    """
+    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
+    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
+    if not system.stable:
+        raise ValueError(
+            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
+            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
+        )
+    return system
+
+
 def transition_matrix(system: Transformation) -> Float[Tensor, "2 2"]:
     """A of (76), with τ² for τ as Ijspeert et al. (2013) have it, in float64.
 
@@ -86,25 +103,6 @@ def transition_matrix(system: Transformation) -> Float[Tensor, "2 2"]:
 def input_vector(system: Transformation) -> Float[Tensor, " 2"]:
     """The vector that multiplies αβ g + f + ε in b of (77), in float64."""
     return torch.tensor([system.dt, 1.0], dtype=torch.float64) * system.dt / system.tau**2
-
-
-def runge_kutta(
-    system: Transformation,
-) -> tuple[Float[Tensor, "2 2"], Float[Tensor, "2 3"]]:
-    """The same system by classical Runge-Kutta steps of fourth order, in float64.
-
-    The second factor multiplies αβ g + f at the beginning, the middle and the end of a step.
-    """
-    dt, eye = system.dt, torch.eye(2, dtype=torch.float64)
-    spring, damping = system.stiffness / system.tau**2, system.alpha / system.tau
-    a = torch.tensor([[0.0, 1.0], [-spring, -damping]], dtype=torch.float64)
-    b = torch.tensor([0.0, 1.0], dtype=torch.float64) / system.tau**2
-    ad = a * dt
-    step = eye + ad @ (eye + ad / 2 @ (eye + ad / 3 @ (eye + ad / 4)))
-    begin = dt / 6 * (eye + ad + ad @ ad / 2 + ad @ ad @ ad / 4) @ b
-    middle = dt / 6 * (4 * eye + 2 * ad + ad @ ad / 2) @ b
-    end = dt / 6 * b
-    return step, torch.stack([begin, middle, end], dim=1)
 
 
 def impulse_response(
@@ -217,13 +215,11 @@ def discrete_basis(
     *,
     kernels: int,
     duration: float,
-    decay: float = DECAY,
-    spread: float = SPREAD,
     normalised: bool = True,
 ) -> Float[Tensor, "*time kernel"]:
     """Ψ_i(s)/ΣΨ of the discrete system (56) at any times, in units of ``duration``.
 
-    Centres are equally spaced in time from 0 to ``duration``; σ_i is ``spread`` times the distance
+    Centres are equally spaced in time from 0 to ``duration``; σ_i is 0.55 of the distance
     to the next centre in s. Rows sum to one, also far outside of the movement; Ψ_i alone comes
     with ``normalised=False``.
 
@@ -232,10 +228,10 @@ def discrete_basis(
     """
     _check_kernels(kernels)
     at = torch.linspace(0, duration, kernels, dtype=time.dtype, device=time.device)
-    centre = phase(at, duration=duration, decay=decay)
-    gap = (centre[:-1] - centre[1:]) * spread
+    centre = phase(at, duration=duration)
+    gap = (centre[:-1] - centre[1:]) * WIDTH
     width = torch.cat([gap, gap[-1:]])
-    s = phase(time, duration=duration, decay=decay)
+    s = phase(time, duration=duration)
     exponent = -0.5 * ((s[..., None] - centre) / width).square()
     return _normalised(exponent) if normalised else exponent.exp()
 
@@ -246,12 +242,11 @@ def rhythmic_basis(
     kernels: int,
     period: float | Tensor,
     offset: float | Tensor = 0.0,
-    spread: float = SPREAD,
     normalised: bool = True,
 ) -> Float[Tensor, "*time kernel"]:
     """Ψ_i(s)/ΣΨ of the rhythmic system (57), (58); s grows by 2π in a ``period``.
 
-    Centres are equally spaced on the circle, h = 1/(``spread`` × distance)²; ``offset`` in rad is
+    Centres are equally spaced on the circle, h = 1/(0.55 distance)²; ``offset`` in rad is
     the phase at time 0; both may be tensors that broadcast with ``time``; Ψ_i alone comes with
     ``normalised=False``.
 
@@ -263,7 +258,7 @@ def rhythmic_basis(
     gap = 2 * math.pi / kernels
     centre = gap * torch.arange(kernels, dtype=time.dtype, device=time.device)
     s = 2 * math.pi * time / period + offset
-    exponent = (torch.cos(s[..., None] - centre) - 1) / (spread * gap) ** 2
+    exponent = (torch.cos(s[..., None] - centre) - 1) / (WIDTH * gap) ** 2
     return _normalised(exponent) if normalised else exponent.exp()
 
 

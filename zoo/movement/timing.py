@@ -1,48 +1,106 @@
-"""Durations, tempos and phases of demonstrations, and their first and last states."""
+"""Timings of movements: durations, or tempo and phase; which are expected, and how they are found.
+
+The one vocabulary of all movement primitives. A *timing* is a duration or a period, with the phase
+at frame 0; *alignment* finds those of training movements, in turn with a template that they share;
+*expected* timings are the equally likely ones of a new movement.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from zoo.movement.conjugate_regression import FLOOR
-from zoo.movement.rollout import Primitive, Timing, roll_out
-from zoo.movement.sufficient_statistics import Movements, of_weights, sights, squares, sums_of
+__all__ = [
+    "Expected",
+    "Kind",
+    "Movements",
+    "Timing",
+    "align",
+    "aligned",
+    "duration",
+    "period_of",
+    "phases",
+    "tempos",
+]
 
-__all__ = ["anchors", "expected", "period_of", "phases", "tempos", "timings_of"]
+Kind = Literal["discrete", "rhythmic"]
+Movements = Sequence[tuple[Float[Tensor, "_time _channel"], Bool[Tensor, "_time _channel"]]]
+Template = TypeVar("Template")
+Found = TypeVar("Found")
 
-PHASES = 16
-TEMPOS = (1.0, 0.8, 0.9, 1.1, 1.25)
-FINE = (1.0, *(1.25 ** (k / 10) for k in range(-10, 11) if k))
-TEMPO_SPREAD = 0.03
-RATIO = 1e-2
+TEMPO_STD = 0.03
+DURATIONS = 16
+ROUNDS = 3
 
 
-def anchors(
-    primitive: Primitive,
-    x: Float[Tensor, "time channel"],
-    seen: Bool[Tensor, "time channel"],
-    timing: Timing,
-) -> Float[Tensor, "channel 3"]:
-    """y₁, ẏ₁ and g of a movement: its first seen frames and its last, or its mean if rhythmic."""
-    if len(x) > 1 and bool(seen.all()):
-        goal = x[-1] if primitive.kind == "discrete" else x.mean(0)
-        return torch.stack([x[0], (x[1] - x[0]) * timing.unit, goal], dim=1)
-    order = torch.arange(len(x))[:, None].expand_as(seen)
-    first = order.where(seen, len(x) - 1).amin(0)
-    second = order.where(seen & (order > first), len(x)).amin(0)
-    last = order.where(seen, 0).amax(0)
-    begin = x.gather(0, first[None])[0]
-    next_ = x.gather(0, second.clamp(max=len(x) - 1)[None])[0]
-    velocity = (next_ - begin) / (second - first).clamp(min=1) * timing.unit
-    velocity = velocity.where(second < len(x), 0)
-    middle = x.sum(0) / seen.sum(0).clamp(min=1)
-    goal = x.gather(0, last[None])[0] if primitive.kind == "discrete" else middle
-    return torch.stack([begin, velocity, goal], dim=1)
+@dataclass(frozen=True)
+class Timing:
+    """Frames in a movement's unit of time (its duration or its period) and the phase at frame 0."""
+
+    unit: float
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Equally likely timings of a new movement."""
+
+    kind: Kind
+    timings: tuple[Timing, ...]
+
+    @classmethod
+    def of(cls, kind: Kind, found: Sequence[Timing], count: int, directions: int) -> Expected:
+        """After those ``found`` of training movements: at most 16 durations, evenly ranked.
+
+        Of rhythmic movements ``count`` tempos about theirs, in each of ``directions`` phases.
+
+        >>> found = [Timing(5.0), Timing(9.0), Timing(6.0)]
+        >>> [t.unit for t in Expected.of("discrete", found, 5, 16).timings]
+        [5.0, 6.0, 9.0]
+        """
+        if kind == "rhythmic":
+            middle, around = tempos(torch.tensor([t.unit for t in found]), count)
+            return cls(kind, tuple(phases(middle, around.tolist(), directions)))
+        units = sorted({t.unit for t in found})
+        ranks = torch.linspace(0, len(units) - 1, min(DURATIONS, len(units))).round().int()
+        return cls(kind, tuple(Timing(units[rank]) for rank in ranks.tolist()))
+
+    @classmethod
+    def stored(
+        cls, kind: Kind, units: Float[Tensor, " timing"], offsets: Float[Tensor, " timing"]
+    ) -> Expected:
+        """Those kept as :attr:`units` and :attr:`offsets`."""
+        return cls(kind, tuple(map(Timing, units.tolist(), offsets.tolist())))
+
+    @property
+    def units(self) -> list[float]:
+        """Durations or periods in frames."""
+        return [t.unit for t in self.timings]
+
+    @property
+    def offsets(self) -> list[float]:
+        """Phases at frame 0 in rad."""
+        return [t.offset for t in self.timings]
+
+    def whole(self, frames: int) -> list[Timing]:
+        """Those of a complete movement of ``frames`` frames."""
+        return list(self.timings) if self.kind == "rhythmic" else [duration(frames)]
+
+    def lasting(self, frames: int) -> list[Timing]:
+        """Those of a movement that goes on after ``frames`` frames; the longest if none does."""
+        going = [t for t in self.timings if self.kind == "rhythmic" or t.unit >= frames]
+        return going or [max(self.timings, key=lambda t: t.unit)]
+
+
+def duration(frames: int) -> Timing:
+    """Timing of a discrete movement of ``frames`` frames."""
+    return Timing(max(1.0, frames - 1.0))
 
 
 def period_of(movements: Movements) -> float:
@@ -70,11 +128,10 @@ def period_of(movements: Movements) -> float:
     return float(begin + int(tail.argmax()))
 
 
-def phases(period: float, tempos: Sequence[float] = TEMPOS, count: int = PHASES) -> list[Timing]:
+def phases(period: float, tempos: Sequence[float], directions: int) -> list[Timing]:
     """Timings that a rhythmic movement may have: tempos around ``period``, all over the circle."""
-    return [
-        Timing(period * tempo, 2 * math.pi * i / count) for tempo in tempos for i in range(count)
-    ]
+    circle = [2 * math.pi * i / directions for i in range(directions)]
+    return [Timing(period * tempo, phase) for tempo in tempos for phase in circle]
 
 
 def tempos(
@@ -82,8 +139,8 @@ def tempos(
 ) -> tuple[float, Float[Tensor, " count"]]:
     """Middle of some periods, and ``count`` equally likely tempos about it of a new movement.
 
-    Log periods are Gaussian, about their mean; their spread is that of the movements and the 3 %
-    by which a tempo changes within one.
+    Log periods are Gaussian, about their mean; their standard deviation is that of the movements
+    and the 3 % by which a tempo changes within one.
 
     >>> middle, around = tempos(torch.tensor([100.0, 110.0, 121.0]), 3)
     >>> round(middle, 6), around.mul(100).round().tolist()
@@ -91,59 +148,44 @@ def tempos(
     """
     log = periods.double().log()
     between = log.var(correction=1) if len(log) > 1 else log.new_zeros(())
-    spread = (between * (1 + 1 / len(log)) + TEMPO_SPREAD**2).sqrt()
+    std = (between * (1 + 1 / len(log)) + TEMPO_STD**2).sqrt()
     levels = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    around = (spread * torch.special.ndtri(levels)).exp()
+    around = (std * torch.special.ndtri(levels)).exp()
     return float(log.mean().exp()), around
 
 
-def expected(found: Sequence[Timing], count: int, directions: int = PHASES) -> list[Timing]:
-    """Equally likely timings of a new rhythmic movement, after those ``found`` of others."""
-    middle, around = tempos(torch.tensor([t.unit for t in found]), count)
-    return phases(middle, around.tolist(), directions)
+def aligned(
+    alone: Template,
+    fitted: Callable[[Found], Template],
+    matched: Callable[[Template], Found],
+    rounds: int = ROUNDS,
+) -> Found:
+    """Timings of movements, in turn with the template that they share.
+
+    They are first ``matched`` to the template of one movement ``alone``, then to that which is
+    ``fitted`` to all at the timings found.
+    """
+    found = matched(alone)
+    for _ in range(rounds - 1):
+        found = matched(fitted(found))
+    return found
 
 
-def timings_of(primitive: Primitive, movements: Movements, period: float | None) -> list[Timing]:
-    """Duration of discrete movements; tempo and phase of rhythmic ones."""
-    if primitive.kind == "discrete":
-        return [Timing(len(x) - 1.0) for x, _ in movements]
-    return _aligned(primitive, movements, period_of(movements) if period is None else period)
+def align(
+    movements: Movements,
+    choices: Sequence[Timing],
+    fitted: Callable[[Movements, list[Timing]], Template],
+    nearest: Callable[[Tensor, Tensor, Template], int],
+) -> list[Timing]:
+    """The choice for every movement, against the longest one first and then against all.
 
+    ``fitted`` is the template of movements at their timings, ``nearest`` the index of the choice at
+    which it is nearest to the entries observed of a movement.
+    """
+    longest = max(movements, key=lambda movement: len(movement[0]))
 
-def _aligned(primitive: Primitive, movements: Movements, period: float) -> list[Timing]:
-    """Phase of every movement at its first frame, against the longest one and then against all."""
-    choices = phases(period)
-    longest = max(range(len(movements)), key=lambda i: len(movements[i][0]))
-    timings = [choices[0]] * len(movements)
-    chosen = [longest]
-    for _ in range(3):
-        template = _pooled(primitive, [movements[i] for i in chosen], [timings[i] for i in chosen])
-        timings = [_nearest(primitive, x, seen, choices, template) for x, seen in movements]
-        chosen = list(range(len(movements)))
-    return timings
+    def matched(template: Template) -> list[Timing]:
+        return [choices[nearest(x, seen, template)] for x, seen in movements]
 
-
-def _pooled(
-    primitive: Primitive, movements: Movements, timings: list[Timing]
-) -> Float[Tensor, "channel kernel"]:
-    ratio = movements[0][0].new_full(movements[0][0].shape[1:], RATIO)
-    sums, _ = sums_of(primitive, ratio, movements, timings)
-    pairs = zip(movements, timings, strict=True)
-    starts = torch.stack([anchors(primitive, x, seen, t) for (x, seen), t in pairs])
-    precision, linear = of_weights(sums, starts)
-    total = precision.sum(0) * (len(linear) / len(precision))
-    size = total.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None].clamp_min(FLOOR)
-    ridge = 1e-6 * size * torch.eye(total.shape[-1], dtype=total.dtype)
-    weights: Tensor = torch.linalg.solve(total + ridge, linear.sum(0)[..., None])
-    return weights[..., 0]
-
-
-def _nearest(
-    primitive: Primitive, x: Tensor, seen: Tensor, choices: list[Timing], template: Tensor
-) -> Timing:
-    start = anchors(primitive, x, seen, choices[0])
-    θ = torch.cat([start, template], dim=1)
-    paths = torch.stack([roll_out(primitive, len(x), choice) @ θ.T for choice in choices])
-    (view,) = sights(primitive, choices[:1], x.new_full(x.shape[1:], RATIO), seen)
-    errors = view.errors((x - paths) * seen)
-    return choices[int(squares(errors, len(choices)).sum(-1).argmin())]
+    alone = fitted([longest], [choices[0]])
+    return aligned(alone, lambda timings: fitted(movements, timings), matched)

@@ -10,14 +10,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zoo.models.baselines.analogues import error_sums
-from zoo.models.baselines.folds import places, starts
+from zoo.models.baselines.places import places, starts
 from zoo.models.baselines.re_entry import Align, Library, Places, dips
+from zoo.movement.cross_validation import splits
 
-__all__ = ["Choice", "Options", "Trials", "forecast"]
+__all__ = ["Continuation", "HeldOutAnalogues", "Options", "continued"]
 
 
 @dataclass(frozen=True)
-class Choice:
+class Continuation:
     """The last ``context`` frames are compared, and ``neighbours`` places continued."""
 
     context: int
@@ -37,10 +38,10 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Trial:
+class HeldOutFutures:
     """Futures of the nearest places of held-out movements, and what was observed."""
 
-    choice: Choice
+    choice: Continuation
     futures: Float[Tensor, "neighbour query time channel"]
     offsets: Float[Tensor, "neighbour query channel"]
     fade: Float[Tensor, "time 1"]
@@ -49,28 +50,30 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Trials:
+class HeldOutAnalogues:
     """Training movements in folds, continued as one that is not in the library would be."""
 
     library: Library
     fold: Int[Tensor, " movement"]
     _jumps: dict[int, Places] = field(default_factory=dict, repr=False)
 
-    def chosen(self, options: Options) -> Choice:
+    def chosen(self, options: Options) -> Continuation:
         """The combination with the least squared error of forecasts, begun early and late."""
         frames = self.library.values.shape[1]
-        total: dict[Choice, float] = {}
+        total: dict[Continuation, float] = {}
         for k in starts(frames):
-            for trial in self._continued(k, options):
-                futures, offsets = trial.futures.cumsum(0), trial.offsets.cumsum(0)
+            for held in self._continued(k, options):
+                futures, offsets = held.futures.cumsum(0), held.offsets.cumsum(0)
                 for n in options.neighbours:
-                    mean = (futures[n - 1] + trial.fade * offsets[n - 1][:, None]) / n
-                    error = ((mean - trial.truth) * trial.asked).square().sum()
-                    one = replace(trial.choice, neighbours=n)
+                    mean = (futures[n - 1] + held.fade * offsets[n - 1][:, None]) / n
+                    error = ((mean - held.truth) * held.asked).square().sum()
+                    one = replace(held.choice, neighbours=n)
                     total[one] = total.get(one, 0.0) + float(error)
         return min(total, key=lambda one: total[one])
 
-    def errors(self, choice: Choice, known: int, count: int) -> Float[Tensor, "3 lead channel"]:
+    def errors(
+        self, choice: Continuation, known: int, count: int
+    ) -> Float[Tensor, "3 lead channel"]:
         """Sums of squared errors, of the neighbours' variance, and their number, by lead time.
 
         Of forecasts from the last ``known`` frames, at ``count`` places of every movement.
@@ -79,16 +82,15 @@ class Trials:
         frames, channels = self.library.values.shape[1:]
         sums = self.library.values.new_zeros(3, frames - known, channels)
         for k in places(known, frames - 1, count):
-            for trial in self._continued(k, options):
-                near = trial.futures + trial.fade * trial.offsets[:, :, None]
-                sums[:, : frames - k] += error_sums(trial.truth - near.mean(0), near, trial.asked)
+            for held in self._continued(k, options):
+                near = held.futures + held.fade * held.offsets[:, :, None]
+                sums[:, : frames - k] += error_sums(held.truth - near.mean(0), near, held.asked)
         return sums
 
-    def _continued(self, known: int, options: Options) -> Iterator[Trial]:
+    def _continued(self, known: int, options: Options) -> Iterator[HeldOutFutures]:
         """Every fold continued by the others, in every way but the number of neighbours."""
         whole, ahead = self.library, self.library.values.shape[1] - known
-        for f in range(int(self.fold.max()) + 1):
-            rows = self.fold == f
+        for f, rows in splits(self.fold):
             others = replace(whole, allowed=whole.allowed & ~rows)
             x, mask = whole.values[rows], whole.seen[rows]
             query = x[:, :known], mask[:, :known]
@@ -101,8 +103,8 @@ class Trials:
                 start = dips(cost, max(options.neighbours))
                 futures = others.at(others.onward(start, ahead, self._jumps[f] if again else None))
                 for align in options.alignments:
-                    yield Trial(
-                        choice=Choice(c, len(futures), align, again),
+                    yield HeldOutFutures(
+                        choice=Continuation(c, len(futures), align, again),
                         futures=futures,
                         offsets=others.offset(*query, start, c, align),
                         fade=others.fade(ahead, c, align),
@@ -111,12 +113,12 @@ class Trials:
                     )
 
 
-def forecast(
+def continued(
     library: Library,
     x: Float[Tensor, "query time channel"],
     mask: Bool[Tensor, "query time channel"],
     horizon: int,
-    choice: Choice,
+    choice: Continuation,
 ) -> Float[Tensor, "neighbour query step channel"]:
     """The continuations of the nearest places."""
     context = min(choice.context, x.shape[1])

@@ -46,7 +46,7 @@ def alignment_cost(
 
 
 def _variance(y: Float[Tensor, "row channel"], n: Float[Tensor, "row channel"]) -> Tensor:
-    """Variance of the entries seen, averaged over channels."""
+    """Variance of the entries observed, averaged over channels."""
     count = n.sum(0).clamp(min=1)
     mean = y.sum(0) / count
     return (((y - mean) * n).square().sum(0) / count).mean()
@@ -54,12 +54,12 @@ def _variance(y: Float[Tensor, "row channel"], n: Float[Tensor, "row channel"]) 
 
 def error_sums(error: Tensor, near: Tensor, asked: Tensor) -> Float[Tensor, "3 *rest"]:
     """Sums over the first axis of squared error, neighbours' variance and their number."""
-    spread = near.var(0, unbiased=False)
-    return (torch.stack([error.square(), spread, torch.ones_like(error)]) * asked).sum(1)
+    variance = near.var(0, unbiased=False)
+    return (torch.stack([error.square(), variance, torch.ones_like(error)]) * asked).sum(1)
 
 
 def sums_of_squares(x: Tensor, m: Tensor, y: Tensor, n: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared difference of every row of x and of y over entries seen in both, and their number."""
+    """Squared difference of rows of x and of y over entries observed in both, and their number."""
     square = x.square() @ n.T + m @ y.square().T - 2 * x @ y.T
     return square.clamp(min=0), m @ n.T
 

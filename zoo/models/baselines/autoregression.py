@@ -15,11 +15,12 @@ from zoo.contract.settings import Count, Positive, Share, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogues import interpolated
 from zoo.models.baselines.banded import conditional, precision
-from zoo.models.baselines.chain_selection import RIDGES, Choice, Trials
+from zoo.models.baselines.chain_selection import RIDGES, ChainSettings, HeldOutChains
 from zoo.models.baselines.chains import Chain
-from zoo.models.baselines.folds import folds_of, places
 from zoo.models.baselines.observation import moments, observe_in_turn
+from zoo.models.baselines.places import places
 from zoo.movement.components import alike
+from zoo.movement.cross_validation import folds_of
 from zoo.movement.demonstrations import movement_groups, movements_of, seen_entries
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -110,17 +111,17 @@ class Autoregression(nn.Module):
         ``intercept`` becomes (level, channel), ``coefficients`` (level, lag, channel, channel),
         ``innovation`` Q (level, channel, channel).
         """
-        trials = self._trials(movements_of("ar", data, self.dtype))
-        self.memory, self.seen, self.fold = trials.values, trials.mask, trials.fold
-        choice = trials.chosen(self._choices(trials, data.channels))
+        held_out = self._held_out(movements_of("ar", data, self.dtype))
+        self.memory, self.seen, self.fold = held_out.values, held_out.mask, held_out.fold
+        choice = held_out.chosen(self._choices(held_out, data.channels))
         self.jointly = torch.tensor([choice.jointly], device=self.seen.device)
         self.ridge = self.memory.new_tensor([choice.ridge])
-        fitted, innovation = trials.fitted(choice)
+        fitted, innovation = held_out.fitted(choice)
         fitted = fitted.stable()
         self.lags = torch.tensor(fitted.lags, device=self.fold.device)
         self.intercept, self.coefficients = fitted.intercept, fitted.coefficients
         self.innovation = self._shrunk(innovation)
-        course = trials.course(choice, self.config.places)
+        course = held_out.course(choice, self.config.places)
         self.lead_ratio, self.channel_ratio = course.ratios(self._variance(len(course.count)))
 
     def _shrunk(self, innovation: Tensor) -> Float[Tensor, "level channel channel"]:
@@ -157,28 +158,28 @@ class Autoregression(nn.Module):
         """p(x_{k+1:k+horizon} | x_{1:k}), its standard deviations times the held-out ratios."""
         longest, mask = self.chain.lags[-1], seen_entries(batch)
         if mask.shape[1] >= longest and bool(mask[:, -longest:].all()):
-            mean, spread, paths = self._ahead(batch.values[:, -longest:], horizon, draws)
+            mean, std, paths = self._ahead(batch.values[:, -longest:], horizon, draws)
         else:
             widen = (0, 0, 0, horizon)
             values, known = (nn.functional.pad(v, widen) for v in (batch.values, mask))
             found = self._conditional(values, known, draws)
-            mean, spread, paths = (part[..., -horizon:, :] for part in found)
+            mean, std, paths = (part[..., -horizon:, :] for part in found)
         lead = torch.arange(horizon, device=mean.device).clamp(max=len(self.lead_ratio) - 1)
         ratio = self.lead_ratio[lead, None] * self.channel_ratio
         wider = mean + ratio * (paths - mean)
-        return Predictive(location=mean[None], epistemic=ratio * spread, draws=wider)
+        return Predictive(location=mean[None], epistemic=ratio * std, draws=wider)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """p(x_missing | x_observed), exact; observed entries are returned as they are."""
         mask = seen_entries(batch)
-        mean, spread, paths = self._conditional(batch.values, mask, draws)
+        mean, std, paths = self._conditional(batch.values, mask, draws)
         patterns, which = torch.unique(mask, dim=0, return_inverse=True)
         count = max(2, self.config.places // len(patterns))
         ratio = torch.stack([self._imputation_ratio(p, count) for p in patterns])[which][:, None]
         rounding = torch.finfo(mean.dtype).eps ** 0.5
         return Predictive(
             location=mean[None],
-            epistemic=(ratio * spread).clamp(min=rounding),
+            epistemic=(ratio * std).clamp(min=rounding),
             draws=mean + ratio * (paths - mean),
         )
 
@@ -186,23 +187,23 @@ class Autoregression(nn.Module):
         self, pattern: Bool[Tensor, "time channel"], movements: int
     ) -> Float[Tensor, " channel"]:
         """Errors over standard deviations where held-out movements miss what ``pattern`` misses."""
-        trials = Trials(self.memory, self.seen, self.fold)
-        choice = Choice(int(self.lags[-1]), bool(self.jointly), float(self.ridge))
+        held_out = HeldOutChains(self.memory, self.seen, self.fold)
+        choice = ChainSettings(int(self.lags[-1]), bool(self.jointly), float(self.ridge))
         frames = min(len(pattern), self.memory.shape[1])
         squares = [torch.zeros_like(self.channel_ratio), torch.zeros_like(self.channel_ratio)]
         last = len(self.memory) - 1
         for i in places(0, last, min(movements, last + 1)):
-            Λ = precision(trials.part(choice, int(self.fold[i])), self.innovation, frames)
+            Λ = precision(held_out.part(choice, int(self.fold[i])), self.innovation, frames)
             x, known = self.memory[i, :frames], self.seen[i, :frames]
-            mean, spread, _ = conditional(Λ, x[None], pattern[:frames] & known, 0)
+            mean, std, _ = conditional(Λ, x[None], pattern[:frames] & known, 0)
             asked = known & ~pattern[:frames]
-            ratio = (mean[0] - x) / spread.clamp(min=torch.finfo(x.dtype).tiny)
+            ratio = (mean[0] - x) / std.clamp(min=torch.finfo(x.dtype).tiny)
             squares[0] += (ratio.square() * asked).sum(0)
             squares[1] += asked.sum(0)
         known = squares[1] > 0
         return torch.where(known, squares[0] / squares[1].clamp(min=1), 1.0).sqrt()
 
-    def _trials(self, data: Sequences) -> Trials:
+    def _held_out(self, data: Sequences) -> HeldOutChains:
         """Movements in folds; one alone is cut in two."""
         mean, _, _ = moments(data.values.flatten(0, 1), data.mask.flatten(0, 1), 0)
         values, mask, group = (
@@ -220,24 +221,28 @@ class Autoregression(nn.Module):
             half = longest // 2
             values, mask = (torch.cat([v[:, :half], v[:, half : 2 * half]]) for v in (values, mask))
             group = torch.arange(2, device=values.device).repeat_interleave(len(data))
-        return Trials(values, mask, folds_of(group))
+        return HeldOutChains(values, mask, folds_of(group))
 
-    def _choices(self, trials: Trials, channels: tuple[str, ...]) -> list[Choice]:
+    def _choices(self, held_out: HeldOutChains, channels: tuple[str, ...]) -> list[ChainSettings]:
         """What the settings leave open and the data allow."""
-        config, frames = self.config, trials.values.shape[1]
+        config, frames = self.config, held_out.values.shape[1]
         most = min((frames - 1) // 2, max(1, STATE // len(channels)))
         orders = [p for p in ORDERS if p <= most] if config.order is None else [config.order]
         couplings = ["channel", "vector"] if config.coupling is None else [config.coupling]
         ridges = RIDGES if config.ridge is None else (config.ridge,)
         pairs = [(p, c == "vector") for p in orders for c in couplings]
-        able = [(p, j) for p, j in pairs if p < frames and bool((trials.runs(p, j) >= RUNS).all())]
+        able = [
+            (p, j) for p, j in pairs if p < frames and bool((held_out.runs(p, j) >= RUNS).all())
+        ]
         if not able:
-            self._refuse(trials, *pairs[0], channels)
-        return [Choice(p, j, ridge) for p, j in able for ridge in ridges]
+            self._refuse(held_out, *pairs[0], channels)
+        return [ChainSettings(p, j, ridge) for p, j in able for ridge in ridges]
 
-    def _refuse(self, trials: Trials, order: int, jointly: bool, channels: tuple[str, ...]) -> None:
-        frames = trials.values.shape[1]
-        runs = trials.runs(order, jointly) if order < frames else trials.values.new_zeros(1)
+    def _refuse(
+        self, held_out: HeldOutChains, order: int, jointly: bool, channels: tuple[str, ...]
+    ) -> None:
+        frames = held_out.values.shape[1]
+        runs = held_out.runs(order, jointly) if order < frames else held_out.values.new_zeros(1)
         worst = int(runs.argmin())
         which = f"channel {channels[worst]}" if len(runs) > 1 else "all channels together"
         raise ValueError(
@@ -266,8 +271,8 @@ class Autoregression(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, standard deviation and joint draws of all entries, given those observed."""
         Λ = precision(self.chain, self.innovation, values.shape[1])
-        mean, spread = values.clone(), torch.zeros_like(values)
+        mean, std = values.clone(), torch.zeros_like(values)
         paths = values.repeat(draws, 1, 1, 1)
         for rows, pattern in alike(mask):
-            mean[rows], spread[rows], paths[:, rows] = conditional(Λ, values[rows], pattern, draws)
-        return mean, spread, paths
+            mean[rows], std[rows], paths[:, rows] = conditional(Λ, values[rows], pattern, draws)
+        return mean, std, paths

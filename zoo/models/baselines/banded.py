@@ -69,12 +69,12 @@ def conditional(
     x = pad(values * mask, tail).flatten(1).unflatten(1, (blocks, entries))
     missing = [(~m).nonzero()[:, 0] for m in pad(mask, tail).flatten().view(blocks, entries)]
     mean, unit, variance = _solved(Λ, x, missing, draws)
-    spread = variance.sqrt()
+    std = variance.sqrt()
     shape = (*mean.shape[:1], -1, width)
     path = mean + unit
     return (
         mean.flatten(1).view(shape)[:, :frames],
-        spread.flatten().view(-1, width)[:frames],
+        std.flatten().view(-1, width)[:frames],
         path.flatten(2).unflatten(2, (-1, width))[:, :, :frames],
     )
 

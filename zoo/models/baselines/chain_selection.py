@@ -10,15 +10,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from zoo.models.baselines.chains import Chain, chain, lags_up_to, sums_of_runs, unexplained
-from zoo.models.baselines.folds import places, starts
+from zoo.models.baselines.places import places, starts
+from zoo.movement.cross_validation import splits
 
-__all__ = ["RIDGES", "Choice", "Course", "Trials"]
+__all__ = ["RIDGES", "ChainSettings", "Course", "HeldOutChains"]
 
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
 @dataclass(frozen=True)
-class Choice:
+class ChainSettings:
     """A linear chain before it is fitted."""
 
     order: int
@@ -45,7 +46,7 @@ class Course:
 
 
 @dataclass(frozen=True)
-class Trials:
+class HeldOutChains:
     """Training movements in folds; ``values`` are without gaps, ``mask`` says what was observed."""
 
     values: Float[Tensor, "sequence frame channel"]
@@ -70,7 +71,7 @@ class Trials:
         count = self.sums(order, jointly)[-1][..., 0, 0]
         return count.sum(0) - count.max(0).values
 
-    def chosen(self, choices: Sequence[Choice]) -> Choice:
+    def chosen(self, choices: Sequence[ChainSettings]) -> ChainSettings:
         """The choice with the least mean squared error of held-out roll-outs."""
         groups: dict[tuple[int, bool], list[float]] = {}
         for c in choices:
@@ -80,10 +81,10 @@ class Trials:
             errors = self._errors(order, jointly, self.values.new_tensor(ridges))
             k = int(errors.argmin())
             if float(errors[k]) < least:
-                best, least = Choice(order, jointly, ridges[k]), float(errors[k])
+                best, least = ChainSettings(order, jointly, ridges[k]), float(errors[k])
         return best
 
-    def fitted(self, choice: Choice) -> tuple[Chain, Float[Tensor, "level channel channel"]]:
+    def fitted(self, choice: ChainSettings) -> tuple[Chain, Float[Tensor, "level channel channel"]]:
         """The chain of all movements, and the covariance of its innovations from those held out."""
         sums = self.sums(choice.order, choice.jointly)
         whole = self._chain([s.sum(0) for s in sums], choice)
@@ -92,13 +93,13 @@ class Trials:
         count = torch.stack([s.sum(0)[:, 0, 0].expand(width) for s in sums])
         return whole, left / count[:, :, None].clamp(min=1)
 
-    def part(self, choice: Choice, fold: int) -> Chain:
+    def part(self, choice: ChainSettings, fold: int) -> Chain:
         """The chain without a fold."""
         return self._chain(
             [s.sum(0) - s[fold] for s in self.sums(choice.order, choice.jointly)], choice
         )
 
-    def course(self, choice: Choice, count: int) -> Course:
+    def course(self, choice: ChainSettings, count: int) -> Course:
         """Errors by lead time of roll-outs from ``count`` places with the whole memory."""
         frames = self.values.shape[1]
         squares = self.values.new_zeros(frames - choice.order, self.values.shape[2])
@@ -110,12 +111,12 @@ class Trials:
                 number[: frames - k] += asked.sum(0)
         return Course(squares, number)
 
-    def _parts(self, choice: Choice) -> Iterator[tuple[int, Chain]]:
+    def _parts(self, choice: ChainSettings) -> Iterator[tuple[int, Chain]]:
         """Every fold with the chain of the others."""
-        for f in range(int(self.fold.max()) + 1):
+        for f, _ in splits(self.fold):
             yield f, self.part(choice, f)
 
-    def _chain(self, sums: list[Tensor], choice: Choice) -> Chain:
+    def _chain(self, sums: list[Tensor], choice: ChainSettings) -> Chain:
         lags, ridge = lags_up_to(choice.order), self.values.new_tensor([choice.ridge])
         one = chain(sums, lags, ridge)
         return Chain(one.lags, one.intercept[0], one.coefficients[0])
@@ -125,7 +126,7 @@ class Trials:
         frames = self.values.shape[1]
         squares, count = torch.zeros_like(ridge), 0.0
         sums = self.sums(order, jointly)
-        for f in range(int(self.fold.max()) + 1):
+        for f, _ in splits(self.fold):
             part = chain([s.sum(0) - s[f] for s in sums], lags_up_to(order), ridge)
             for k in starts(frames):
                 error, asked = self._missed(part, f, k)

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from zoo.movement.cross_validation import splits
+
 __all__ = ["Chain", "chain", "lags_up_to", "sums_of_runs", "unexplained"]
 
 
@@ -131,11 +133,8 @@ def sums_of_runs(
     parts = [values[:, s].unflatten(-1, (blocks, -1)) for s in shifts]
     whole = torch.stack([mask[:, s].unflatten(-1, (blocks, -1)).all(-1) for s in shifts]).all(0)
     u = torch.cat([torch.ones_like(parts[0][..., :1]), *parts], -1) * whole[..., None]
-    sums = []
-    for f in range(int(fold.max()) + 1):
-        rows = u[fold == f].flatten(0, 1).transpose(0, 1)
-        sums.append(rows.mT @ rows)
-    return torch.stack(sums)
+    parts = [u[held].flatten(0, 1).transpose(0, 1) for _, held in splits(fold)]
+    return torch.stack([rows.mT @ rows for rows in parts])
 
 
 def chain(

@@ -19,7 +19,7 @@ from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.baselines.analogues import carried, interpolated
 from zoo.models.baselines.observation import moments, normal, observe_in_turn
-from zoo.models.baselines.ridge_regression import Kernel, Problem, left_out_squares, predicted
+from zoo.models.baselines.ridge_regression import Kernel, Problem, held_out_squares, predicted
 from zoo.movement.components import alike
 from zoo.movement.demonstrations import movement_groups, movements_of, seen_entries
 from zoo.prediction.predictive import Predictive
@@ -69,12 +69,12 @@ class Pattern:
         return -min(0, *self.offsets, 0), max(0, *self.offsets, 0)
 
     def inputs(self, values: Tensor, row: Tensor, frame: Tensor) -> Float[Tensor, "place feature"]:
-        """The entries seen around frames of movements."""
+        """The entries observed around frames of movements."""
         near = values[row[:, None], frame[:, None] + torch.tensor(self.offsets, dtype=torch.long)]
         return near[:, torch.tensor(self.seen, dtype=torch.bool).view(near.shape[1:])]
 
     def line(self) -> Float[Tensor, "feature target"]:
-        """The map from the entries seen to a line through each channel's nearest two, or one."""
+        """The map from entries observed to a line through each channel's nearest two, or one."""
         places = [(i, c) for i, row in enumerate(self.seen) for c, s in enumerate(row) if s]
         asked = [c for c, a in enumerate(self.asked) if a]
         matrix = torch.zeros(len(places), len(asked), dtype=torch.float64)
@@ -90,25 +90,25 @@ class Pattern:
 
 
 class KernelRidge(nn.Module):
-    """Entries that are missing or still to come are regressed on the entries seen around them.
+    """Entries that are missing or still to come are regressed on the entries observed around them.
 
     x_tc ~ N(b_tc + m_c + k(u_t)ᵀ(K + λI)⁻¹(Y − B − m), s_tc²),   k(u, u′) = exp(−‖u − u′‖²/(2ℓ²))
 
-    u_t holds the entries seen in the frames nearest to t; Y and K come from all places of the
+    u_t holds the entries observed in the frames nearest to t; Y and K come from all places of the
     training movements, with the same entries hidden. b_tc is 0, or a line in time through the
     channel's own nearest entries. Each frame of a gap or a forecast has a regression of its own, so
     that errors do not feed on themselves. ℓ, λ and b are those with the least squared error of
-    training movements left out, windows of one movement together, over three of the frames asked
+    held-out training movements, windows of one movement together, over three of the frames asked
     for; s_tc is the root mean square of these errors. Saunders, Gammerman & Vovk, *Ridge regression
-    learning algorithm in dual variables* (1998); errors of groups left out in closed form from
+    learning algorithm in dual variables* (1998); errors of held-out groups in closed form from
     (K + λI)⁻¹. It is a baseline, not in the thesis, and it has no guide: there is no latent
     variable.
 
-    Seen entries are returned as they are. Missing training entries are interpolated in time; errors
-    leave them out. Bands have the same width wherever a movement lies, and noise is independent
-    from frame to frame: joint draws are rough. It asks for training movements that are as long as
-    the gap with its context, and solves its regressions when it is asked. The generative program
-    scores a movement one step at a time.
+    Observed entries are returned as they are. Missing training entries are interpolated in time;
+    errors leave them out. Bands have the same width wherever a movement lies, and noise is
+    independent from frame to frame: joint draws are rough. It asks for training movements that are
+    as long as the gap with its context, and solves its regressions when it is asked. The generative
+    program scores a movement one step at a time.
 
     Defaults: 5 frames of context on either side, 600 places; data standardised.
     """
@@ -134,7 +134,7 @@ class KernelRidge(nn.Module):
         movements = movements_of("kernel-ridge", data, self.dtype)
         group = movement_groups(movements)
         if len(group.unique()) < 2:
-            raise ValueError("kernel-ridge needs at least 2 movements to fit its spread; got 1")
+            raise ValueError("kernel-ridge needs at least 2 movements to fit its errors; got 1")
         mean, _, _ = moments(movements.values.flatten(0, 1), movements.mask.flatten(0, 1), 0)
         self.memory = interpolated(movements.values, movements.mask, mean)
         self.seen, self.lengths, self.group = movements.mask, movements.lengths, group
@@ -161,14 +161,14 @@ class KernelRidge(nn.Module):
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """Every frame to come from the last frames seen."""
+        """Every frame to come from the last frames observed."""
         known = batch.values.shape[1]
         widen = (0, 0, 0, horizon)
         values, seen = pad(batch.values, widen), pad(seen_entries(batch), widen)
         return self._filled(values, seen, range(known, known + horizon))
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """The missing entries from those seen around them; seen entries as they are."""
+        """The missing entries from those seen around them; observed entries as they are."""
         return self._filled(batch.values, seen_entries(batch), range(batch.values.shape[1]))
 
     def _filled(self, values: Tensor, seen: Tensor, frames: range) -> Predictive:
@@ -214,7 +214,7 @@ class KernelRidge(nn.Module):
         for pattern in (patterns[i] for i in pick.tolist()):
             line = pattern.line()
             both = self._problem(pattern, torch.cat([0 * line, line], 1))
-            total += left_out_squares(both, KERNELS).unflatten(1, (2, -1)).sum(-1)
+            total += held_out_squares(both, KERNELS).unflatten(1, (2, -1)).sum(-1)
         best = int(total.argmin())
         return KERNELS[best // 2], float(best % 2)
 

@@ -35,14 +35,14 @@ class LastValue(nn.Module):
 
     x_{k+h} | x_k ~ N(x_k, s_h²)
 
-    The spread s_h of every channel is the root mean square of x_{t+h} − x_t over all training
-    frames, fitted for each lead time h on its own; leads longer than the training movements grow
-    with √h as a random walk does. Joint draws have stationary increments: covariance
+    The standard deviation s_h of every channel is the root mean square of x_{t+h} − x_t over all
+    training frames, fitted for each lead time h on its own; leads longer than the training
+    movements grow with √h as a random walk does. Joint draws have stationary increments: covariance
     (s_h² + s_h'² − s_{|h−h'|}²)/2, projected to the nearest positive one with the same s_h. There
-    is no observation noise: all spread is of the path. A channel counts its lead from the frame
-    that it was last seen in; one that was not seen at all gets its training mean and deviation.
-    It knows no velocity and no posture: it says what standing still is worth. It is a baseline, not
-    in the thesis, and it has no guide: there is no latent variable.
+    is no observation noise: all uncertainty is of the path. A channel counts its lead from the
+    frame that it was last seen in; one that was not seen at all gets its training mean and
+    deviation. It knows no velocity and no posture: it says what standing still is worth. It is a
+    baseline, not in the thesis, and it has no guide: there is no latent variable.
 
     Defaults: data standardised; missing entries left out.
     """
@@ -80,7 +80,7 @@ class LastValue(nn.Module):
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """The last values, with the spread of their leads."""
+        """The last values, with the standard deviations of their leads."""
         check_fitted("last-value", self.spread)
         frames = batch.values.shape[1]
         last = _last_seen(seen_entries(batch))[:, -1:].expand(-1, horizon, -1)
@@ -103,7 +103,7 @@ class LastValue(nn.Module):
     def _held(
         self, values: Tensor, last: Int[Tensor, "window time channel"], lead: Tensor
     ) -> tuple[Float[Tensor, "window time channel"], Float[Tensor, "window time channel"]]:
-        """Location and spread of entries ``lead`` frames after frame ``last`` (-1: never seen)."""
+        """Moments of entries ``lead`` frames after frame ``last`` (-1: never observed)."""
         spread = self._spread(lead)
         held = values.gather(1, last.clamp(min=0))
         never = last < 0
@@ -135,7 +135,7 @@ class LastValue(nn.Module):
 
 
 def _increment(values: Tensor, mask: Tensor, lead: int) -> Float[Tensor, " channel"]:
-    """Root mean square of x_{t+lead} − x_t; NaN where no pair of frames was seen."""
+    """Root mean square of x_{t+lead} − x_t; NaN where no pair of frames was observed."""
     both = mask[:, lead:] & mask[:, :-lead]
     step = (values[:, lead:] - values[:, :-lead]) * both
     return (step.square().sum((0, 1)) / both.sum((0, 1))).sqrt()

@@ -50,7 +50,7 @@ class _Moments(nn.Module):
 
 
 class Mean(_Moments):
-    """Every frame is the mean of that frame over the training movements, whatever was seen.
+    """Every frame is the mean of that frame over the training movements, whatever was observed.
 
     x_{t,c} ~ N(m_{t,c}, s_{t,c}²), m_{t,c} known to s_{t,c}/√n
 

@@ -13,12 +13,18 @@ from torch import Tensor, nn
 from zoo.contract.readiness import check_fitted
 from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
-from zoo.models.baselines.analogue_selection import Choice, Options, Trials, forecast
+from zoo.models.baselines.analogue_selection import (
+    Continuation,
+    HeldOutAnalogues,
+    Options,
+    continued,
+)
 from zoo.models.baselines.analogues import carried, error_sums, interpolated
-from zoo.models.baselines.folds import folds_of, places
 from zoo.models.baselines.gaps import Gaps
 from zoo.models.baselines.observation import moments, normal, observe_in_turn
+from zoo.models.baselines.places import places
 from zoo.models.baselines.re_entry import ALIGNMENTS, Align, Library
+from zoo.movement.cross_validation import folds_of
 from zoo.movement.demonstrations import movement_groups, movements_of, seen_entries
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior
@@ -70,7 +76,7 @@ class NearestNeighbour(nn.Module):
 
     Imputation compares frame by frame, near frames counting most, and takes the missing entries
     from the nearest places, shifted by what they lie below the frames observed if that helps: its
-    settings and its s are fitted when it is asked, on left-out training movements with the same
+    settings and its s are fitted when it is asked, on held-out training movements with the same
     entries hidden. Fix & Hodges (1951); Lorenz, *Atmospheric predictability as revealed by
     naturally occurring analogues*, J. Atmos. Sci. 26 (1969).
 
@@ -115,14 +121,14 @@ class NearestNeighbour(nn.Module):
         self.group = self._groups(movements)
         mean, _, _ = moments(movements.values.flatten(0, 1), self.seen.flatten(0, 1), 0)
         self.memory = interpolated(movements.values, self.seen, mean)
-        trials = Trials(self.library, folds_of(self.group))
-        choice = trials.chosen(self._options())
+        held_out = HeldOutAnalogues(self.library, folds_of(self.group))
+        choice = held_out.chosen(self._options())
         kind = ALIGNMENTS.index(choice.align)
         kept = [choice.context, choice.neighbours, kind, int(choice.re_enter)]
         self.chosen = self.lengths.new_tensor(kept)
         levels = [c for c in CONTEXTS if c < choice.context] + [choice.context]
         self.contexts = self.lengths.new_tensor(levels)
-        self.noise = torch.stack([self._forecast_noise(trials, choice, c) for c in levels])
+        self.noise = torch.stack([self._forecast_noise(held_out, choice, c) for c in levels])
 
     @property
     def library(self) -> Library:
@@ -132,11 +138,11 @@ class NearestNeighbour(nn.Module):
         return Library(self.memory, self.seen, self.lengths, everybody)
 
     @property
-    def choice(self) -> Choice:
+    def choice(self) -> Continuation:
         """How they are continued."""
         check_fitted("nearest-neighbour", self.noise)
         context, neighbours, align, again = self.chosen.tolist()
-        return Choice(context, neighbours, ALIGNMENTS[align], bool(again))
+        return Continuation(context, neighbours, ALIGNMENTS[align], bool(again))
 
     def forward(self, batch: Batch) -> Tensor:
         """The generative program: every frame after the first from the frames before it."""
@@ -153,7 +159,7 @@ class NearestNeighbour(nn.Module):
         return normal(location, deviation, seen[:, frames])
 
     def _next(self, x: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        step = forecast(self.library, x, seen, 1, self.choice)[:, :, 0]
+        step = continued(self.library, x, seen, 1, self.choice)[:, :, 0]
         noise = self._noise(x.shape[1], 1)[0]
         return step.mean(0), step.var(0, unbiased=False) + noise.square()
 
@@ -162,7 +168,7 @@ class NearestNeighbour(nn.Module):
     ) -> Predictive:
         """The continuations of the nearest places, one component each."""
         mask = seen_entries(batch)
-        location = forecast(self.library, batch.values, mask, horizon, self.choice)
+        location = continued(self.library, batch.values, mask, horizon, self.choice)
         noise = self._noise(batch.values.shape[1], horizon)
         return Predictive(location=location, noise=noise, joint=True)
 
@@ -208,12 +214,12 @@ class NearestNeighbour(nn.Module):
         )
 
     def _forecast_noise(
-        self, trials: Trials, choice: Choice, known: int
+        self, held_out: HeldOutAnalogues, choice: Continuation, known: int
     ) -> Float[Tensor, "lead channel"]:
         """s_h after ``known`` frames, as many leads for all; unknown ones as the last known."""
-        wrong, spread, count = trials.errors(choice, known, self.config.positions)
+        wrong, variance, count = held_out.errors(choice, known, self.config.positions)
         number = count.clamp(min=1)
-        s = carried(self._unexplained(wrong / number, spread / number), count > 0)
+        s = carried(self._unexplained(wrong / number, variance / number), count > 0)
         index = torch.arange(self.memory.shape[1] - 1, device=s.device).clamp(max=len(s) - 1)
         longer: Tensor = s[index]
         return longer
@@ -228,7 +234,7 @@ class NearestNeighbour(nn.Module):
     def _tuned(
         self, pattern: Bool[Tensor, "time channel"], movements: int
     ) -> tuple[Gaps, int, bool, Float[Tensor, " channel"]]:
-        """Decay, neighbours, shift and s where left-out movements miss what ``pattern`` misses."""
+        """Decay, neighbours, shift and s where held-out movements miss what ``pattern`` misses."""
         config = self.config
         decays = DECAYS if config.decay is None else (config.decay,)
         sizes: Sequence[int] = NEIGHBOURS if config.neighbours is None else (config.neighbours,)
@@ -238,8 +244,8 @@ class NearestNeighbour(nn.Module):
         gappy = ~pattern.all(0)
         error = sums[..., 0, :][..., gappy].sum(-1)[:, [int(s) for s in shifts]]
         d, a, n = (int(v) for v in torch.unravel_index(error.argmin(), error.shape))
-        wrong, spread, count = sums[d, int(shifts[a]), n]
-        s = self._unexplained(wrong / count.clamp(min=1), spread / count.clamp(min=1))
+        wrong, variance, count = sums[d, int(shifts[a]), n]
+        s = self._unexplained(wrong / count.clamp(min=1), variance / count.clamp(min=1))
         return every[d], sizes[n], shifts[a], s
 
     def _left_out(
@@ -262,7 +268,7 @@ class NearestNeighbour(nn.Module):
         each: Tensor = torch.stack(sums).unflatten(0, (2, len(sizes)))
         return each
 
-    def _unexplained(self, error: Tensor, spread: Tensor) -> Tensor:
+    def _unexplained(self, error: Tensor, between: Tensor) -> Tensor:
         """s from the mean squared error and the neighbours' variance, at least half the error."""
-        variance = torch.maximum(error - spread, error / 4)
+        variance = torch.maximum(error - between, error / 4)
         return variance.clamp(min=self.config.noise_floor**2).sqrt()

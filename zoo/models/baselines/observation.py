@@ -16,7 +16,7 @@ __all__ = ["moments", "normal", "observe", "observe_in_turn"]
 
 
 def moments(values: Tensor, mask: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, standard deviation (n − 1) and count of the entries seen, over one axis.
+    """Mean, standard deviation (n − 1) and count of the entries observed, over one axis.
 
     >>> x = torch.tensor([[1.0, 3.0], [3.0, 0.0]])
     >>> mean, deviation, count = moments(x, torch.tensor([[True, True], [True, False]]), 0)
@@ -31,7 +31,7 @@ def moments(values: Tensor, mask: Tensor, dim: int) -> tuple[Tensor, Tensor, Ten
 
 
 def observe(batch: Batch, likelihood: dist.TorchDistribution) -> Tensor:
-    """The observed site ``x``: the seen entries of every window under ``likelihood``."""
+    """The observed site ``x``: the observed entries of every window under ``likelihood``."""
     with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
         site = likelihood.mask(seen_entries(batch)).to_event(2)
         x: Tensor = pyro.sample("x", site, obs=batch.given(batch.values))

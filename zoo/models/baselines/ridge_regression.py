@@ -1,4 +1,4 @@
-"""Kernel ridge regression of many outputs, with errors of groups left out in closed form."""
+"""Kernel ridge regression of many outputs, with errors of held-out groups in closed form."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["Kernel", "Problem", "left_out", "left_out_squares", "predicted", "square_distances"]
+from zoo.movement.cross_validation import held_out_errors
+
+__all__ = ["Kernel", "Problem", "held_out_squares", "predicted", "square_distances"]
 
 
 @dataclass(frozen=True)
@@ -44,39 +46,23 @@ def square_distances(x: Tensor, y: Tensor) -> Float[Tensor, "row column"]:
     return both.clamp(min=0)
 
 
-def left_out(
-    inverse: Float[Tensor, "place place"],
-    outputs: Float[Tensor, "place target"],
-    group: Int[Tensor, " place"],
-) -> Float[Tensor, "place target"]:
-    """Errors at every place of the regression without its group, given (K + λI)⁻¹.
-
-    With α = (K + λI)⁻¹ y the error of group g is ((K + λI)⁻¹_gg)⁻¹ α_g: no regression is repeated.
-    """
-    α, error = inverse @ outputs, torch.empty_like(outputs)
-    for g in group.unique():
-        here = (group == g).nonzero()[:, 0]
-        error[here] = torch.linalg.solve(inverse[here][:, here], α[here])
-    return error
-
-
 def predicted(
     kernel: Kernel, problem: Problem, queries: Float[Tensor, "query feature"]
 ) -> tuple[Float[Tensor, "query target"], Float[Tensor, " target"]]:
-    """Outputs of ``queries``, and the root mean square of the errors of groups left out."""
+    """Outputs of ``queries``, and the root mean square of the errors of held-out groups."""
     mean = _mean(problem)
     distances = square_distances(problem.inputs, problem.inputs)
     gram = kernel.gram(distances, _unit(distances))
     root = torch.linalg.cholesky(gram + kernel.ridge * torch.eye(len(gram), dtype=gram.dtype))
     inverse = torch.cholesky_inverse(root)
-    error = left_out(inverse, problem.outputs - mean, problem.group)
+    error = held_out_errors(inverse, problem.outputs - mean, problem.group)
     near = kernel.gram(square_distances(queries, problem.inputs), _unit(distances))
     square = (error.square() * problem.seen).sum(0) / problem.seen.sum(0).clamp(min=1)
     return mean + near @ (inverse @ (problem.outputs - mean)), square.sqrt()
 
 
-def left_out_squares(problem: Problem, kernels: Sequence[Kernel]) -> Float[Tensor, "kernel target"]:
-    """Summed squared errors of groups left out; kernels of one width share a decomposition."""
+def held_out_squares(problem: Problem, kernels: Sequence[Kernel]) -> Float[Tensor, "kernel target"]:
+    """Summed squared errors of held-out groups; kernels of one width share a decomposition."""
     distances = square_distances(problem.inputs, problem.inputs)
     centred = problem.outputs - _mean(problem)
     grams = {k.width: k.gram(distances, _unit(distances)) for k in kernels}
@@ -85,7 +71,7 @@ def left_out_squares(problem: Problem, kernels: Sequence[Kernel]) -> Float[Tenso
     for kernel in kernels:
         values, vectors = parts[kernel.width]
         inverse = (vectors / (values.clamp(min=0) + kernel.ridge)) @ vectors.mT
-        error = left_out(inverse, centred, problem.group)
+        error = held_out_errors(inverse, centred, problem.group)
         squares.append((error.square() * problem.seen).sum(0))
     return torch.stack(squares)
 

@@ -25,7 +25,7 @@ class Config:
     """Settings of :class:`Dvbf`.
 
     ``bases`` matrices A^(i), B^(i), C^(i), weighed by a network of ``transition_hidden`` units;
-    ``noise_scale`` is where C starts; ``output_std`` where the constant output spread starts, in
+    ``noise_scale`` is where C starts; ``output_std`` where the constant σ starts, in
     scaled units, never below ``output_floor``.
     """
 
@@ -48,12 +48,12 @@ class Dvbf(nn.Module):
     Thesis §6.2.1; Karl, Soelch, Bayer & van der Smagt, *Deep variational Bayes filters*, ICLR 2017:
     the reconstruction goes through the transition, so that the state has to hold all that the
     future needs. ``a_t`` are the data's controls at the frame they act from; data without controls
-    have none. A forecast filters the frames seen and goes on with noise from the prior; it needs
-    the actions to come. Missing entries are left out of the likelihood and are 0, the training
-    mean, to the guide. It has no goal and fills no gaps from both sides (no generate, no impute);
-    the matrices and all networks are point estimates (Karl et al. have q(v) over the matrices), and
-    w_1 is recognised from five frames, not by a smoother over the whole window: bands want
-    calibration.
+    have none. A forecast filters the frames observed and goes on with noise from the prior; it
+    needs the actions to come. Missing entries are left out of the likelihood and are 0, the
+    training mean, to the guide. It has no goal and fills no gaps from both sides (no generate, no
+    impute); the matrices and all networks are point estimates (Karl et al. have q(v) over the
+    matrices), and w_1 is recognised from five frames, not by a smoother over the whole window:
+    bands want calibration.
 
     Defaults: 8 coordinates, 16 bases, 200 hidden units, σ constant in time; data standardised.
     """
@@ -80,7 +80,7 @@ class Dvbf(nn.Module):
 
     @property
     def output_std(self) -> Float[Tensor, " channel"]:
-        """The constant spread of every channel."""
+        """The constant standard deviation of every channel."""
         return self.output_root.square() + self.config.output_floor
 
     def forward(self, batch: Batch) -> None:
@@ -127,7 +127,7 @@ class Dvbf(nn.Module):
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """Joint draws of the future: the frames seen are filtered, then the noise is the prior's.
+        """Joint draws of the future: the frames observed are filtered, later noise is the prior's.
 
         ``batch.inputs`` must hold the actions up to the last frame but one of the forecast.
         """

@@ -1,4 +1,4 @@
-"""What is generative in VAE-DMP: a linear latent state, driven by a DMP, decoded frame by frame."""
+"""Networks and constants of VAE-DMP, the densities of its weights and its decoder."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from torch import Tensor, nn
 
 from zoo.contract.settings import Count, Positive, settings
 from zoo.movement.lengths import common_length
-from zoo.movement.plan import Plan
+from zoo.movement.plan import Latents, Plan
 from zoo.movement.response import (
-    Response,
-    Transformation,
+    critical_system,
     discrete_basis,
     input_vector,
     transition_matrix,
 )
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp
-from zoo.types import Batch, Layout
+from zoo.prediction.predictive import Predictive
+from zoo.types import Layout
 
 __all__ = ["Config", "LatentDmp"]
 
-ALPHA, ALPHA_FRAME = 25.0, 0.4
 BEYOND = 0.1
 
 
@@ -36,10 +35,10 @@ class Config:
     """``latent_dim`` d', ``hidden`` decoder units of ``activation``, ``kernels``, α (β = α/4).
 
     None for α is 25 a movement, or 0.4 a frame for movements under 64 frames, whose Euler steps
-    are unstable otherwise. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
+    would else be unstable. ``w_scale`` and ``velocity_scale`` are the prior standard deviations of
     w and ż_1, in units of the acceleration αβ and of the movement's length; ``noise_scale`` is
     where w_ε starts, in the same unit as w, and stays where ``fixed_noise``; ``output_std`` where
-    the constant output standard deviation starts, in scaled units, never below ``output_floor``.
+    the constant σ starts, in scaled units, never below ``output_floor``.
 
     ``goal_scaling`` multiplies the forcing term by z^goal − z_0, the first frame, as §6.3.2 does:
     w then says how a movement goes to its goal, wherever that is. ``common_forcing`` is the
@@ -95,7 +94,7 @@ class LatentDmp(nn.Module):
         self.latent_dim, self.kernels = config.latent_dim, config.kernels
         self.goal_scaling = config.goal_scaling
         channels, latent = len(layout.channels), config.latent_dim
-        self.system = _system(config.alpha, self.frames)
+        self.system = critical_system(config.alpha, self.frames)
         self.decoder = mlp([latent, config.hidden, channels], config.activation)
         self.g = mlp([latent, config.transition_hidden, latent], "tanh")
         nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
@@ -116,7 +115,7 @@ class LatentDmp(nn.Module):
 
     @property
     def output_std(self) -> Float[Tensor, " channel"]:
-        """The constant spread of every channel, (83)."""
+        """The constant standard deviation of every channel, (83)."""
         return self.output_root.square() + self.config.output_floor
 
     @property
@@ -132,9 +131,9 @@ class LatentDmp(nn.Module):
     def forcing_prior(self, rows: int) -> TorchDistribution:
         """p(w) of ``rows`` movements."""
         shape = [rows, self.kernels, self.latent_dim]
-        zero, spread = self.basis.new_zeros(()), self.config.common_forcing
-        mean = zero if spread is None else self.w_common
-        prior = dist.Normal(mean, zero + (1.0 if spread is None else spread), validate_args=False)
+        zero, std = self.basis.new_zeros(()), self.config.common_forcing
+        mean = zero if std is None else self.w_common
+        prior = dist.Normal(mean, zero + (1.0 if std is None else std), validate_args=False)
         normal: TorchDistribution = prior.expand(shape).to_event(2)
         return normal
 
@@ -155,87 +154,24 @@ class LatentDmp(nn.Module):
         size = jacobians(self.decoder, points).square().sum((-1, -2))
         return -self.config.flatness * (size / size.mean() - 1).square()
 
-    def noise_gain(self) -> Float[Tensor, "latent state"]:
-        """G: ε = ε̂ w_ε enters the next state as (77) says."""
-        return (self.system.stiffness * self.w_noise) @ self.step_input
-
-    def initial_state(
-        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
-    ) -> Float[Tensor, "window state"]:
-        """(z*_1, ż_1) of a window's first frame."""
-        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
-
-    def forces(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window latent"]:
-        """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
-        steps = batch.values.shape[1] - 1
-        goal = self.embed(plan.goal)
-        w = self.scaled(plan.w, goal, None if plan.start is None else self.embed(plan.start))
-        pull = goal + self.forcing(w, plan)
-        at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
-        row = at * pull.shape[1] + batch.sequence
-        picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
-        return picked.view(steps, len(batch), -1)
-
-    def forcing(
-        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
-    ) -> Float[Tensor, "step sequence latent"]:
-        """f_t in units of αβ of every step of whole movements, time-major."""
-        return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
-
-    def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
-        """What goal and forcing term add to the state in every step, (77)."""
-        return self.forces(plan, batch) @ self.step_input
-
-    def path(
-        self,
-        z: Float[Tensor, "window latent"],
-        velocity: Float[Tensor, "window latent"],
-        plan: Plan,
-        ε: Float[Tensor, "window step latent"],
-        batch: Batch,
-    ) -> Float[Tensor, "window time latent"]:
-        """z*_{1:T} by the linear response of (75): no loop over time."""
-        steps = batch.values.shape[1]
-        response = Response.of(self.system, steps, z.dtype, z.device)
-        noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
-        force = self.forces(plan, batch) + noise
-        begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
-        states = response.product(begin.flatten(1), force.flatten(1))
-        return states[0].view(steps, len(batch), -1).transpose(0, 1)
-
-    def paths(
-        self,
-        z: Float[Tensor, "*sample window time latent"],
-        velocity: Float[Tensor, "*sample window latent"],
-        plan: Plan,
-        ε: Float[Tensor, "*sample window step latent"],
-        batch: Batch,
-    ) -> Float[Tensor, "*sample window time latent"]:
-        """The paths of every draw of the program's sites, such as Pyro's vectorised particles."""
-        lead = z.shape[:-3]
-        if not lead:
-            return self.path(z[:, 0], velocity, plan, ε, batch)
-        parts = zip(
-            z.flatten(0, -4), velocity.flatten(0, -3), plan.draws(), ε.flatten(0, -4), strict=True
+    def _latents(self, drawn: dict[str, Tensor]) -> Latents:
+        start = self.embed(drawn["start"]) if self.goal_scaling else None
+        goal = self.embed(drawn["goal"])
+        return Latents(
+            w=self.scaled(drawn["w"], goal, start),
+            plan=Plan.of(drawn),
+            goal=goal,
+            position=self.embed(drawn["z"][:, :, 0]),
+            velocity=self.config.velocity_scale * drawn["velocity"],
         )
-        found = [self.path(z[:, 0], v, p, ε, batch) for z, v, p, ε in parts]
-        paths: Tensor = torch.stack(found).unflatten(0, lead)
-        return paths
+
+    def decode(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
+        """p(x_t | z*_t)."""
+        location = self.decoder(paths.to(self.output_root))
+        return Predictive(location=location, noise=self.output_std, joint=True)
 
     def kernels_at(self, steps: int, duration: float = 1.0) -> Float[Tensor, "step kernel"]:
         """Ψ of the first ``steps`` steps of a movement ``duration`` times as long, in float64."""
         time = torch.arange(steps, dtype=torch.float64)
         whole = (self.frames - 1) * duration
         return discrete_basis(time, kernels=self.kernels, duration=whole)
-
-
-def _system(alpha: float | None, frames: int) -> Transformation:
-    """The critically damped system, a movement long in its unit of time."""
-    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
-    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
-    if not system.stable:
-        raise ValueError(
-            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
-            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
-        )
-    return system

@@ -6,17 +6,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from zoo.contract.readiness import need
 from zoo.errors import NotFittedError
 from zoo.inference.laplace import laplace
 from zoo.models.filters.latent_dmp import Config, LatentDmp
-from zoo.movement.demonstrations import extremes
+from zoo.movement.demonstrations import extremes, seen_entries
 from zoo.movement.lengths import check_end
 from zoo.movement.paths import Conditioned, PathPrior, Readout
-from zoo.movement.plan import Latents, Plan
 from zoo.movement.response import Response
+from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior
 
-__all__ = ["LatentPathPrior", "observed"]
+__all__ = ["PRIOR_DRAWS", "LatentPathPrior"]
 
 _LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_shape", "reached")
 PRIOR_DRAWS = 32
@@ -44,6 +45,19 @@ class LatentPathPrior(LatentDmp):
         for name in _LEARNED:
             self.register_buffer(name, torch.empty(0))
 
+    def forecast(
+        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
+    ) -> Predictive:
+        """Joint draws of the future given the encoded frames; phase 0 is the first frame."""
+        seen = batch.values.shape[1]
+        paths = self._conditioned(batch, need(posterior), seen + horizon).sample(draws)
+        return self.decode(paths[:, :, seen:])
+
+    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
+        """Joint draws of whole movements given the entries observed."""
+        paths = self._conditioned(batch, need(posterior), batch.values.shape[1]).sample(draws)
+        return self.decode(paths)
+
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
         """Keep the latents of the training movements, and what the encoder sees beside them.
 
@@ -53,7 +67,7 @@ class LatentPathPrior(LatentDmp):
         found = self._latents(posterior.draw(batch, PRIOR_DRAWS))
         parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
         self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
-        self.reached = extremes(batch.values, observed(batch))
+        self.reached = extremes(batch.values, seen_entries(batch))
         frames, seen = self._observe(batch, posterior), self._frames_seen(batch)
         self.prior_residuals = torch.zeros_like(frames)
         self.prior_shape = frames.new_empty(0)
@@ -63,6 +77,19 @@ class LatentPathPrior(LatentDmp):
             (self.frames // 7, self.frames // 2), self._readout(frames), self.prior_without
         )
         self.prior_shape = frames.new_tensor(tuned.shape)
+
+    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
+        """σ of movements that no network was trained on, never below what training found.
+
+        σ² = E_q (x − μ(g(z)))² is what maximises their bound (80); a decoder fits the frames that
+        it was trained on better than others.
+        """
+        z = posterior.encode(batch.values, batch.mask).sample((PRIOR_DRAWS,))
+        error = (self.decoder(self.embed(z)) - batch.values).square().mean(0)
+        mask = seen_entries(batch)
+        mean = (error * mask).sum((0, 1)) / mask.sum((0, 1)).clamp(min=1)
+        std = torch.maximum(mean.sqrt(), self.output_std)
+        self.output_root.copy_((std - self.config.output_floor).sqrt())
 
     def prior_without(self, row: int) -> PathPrior:
         """The mixture over latent paths of all training movements but one."""
@@ -86,17 +113,6 @@ class LatentPathPrior(LatentDmp):
         if batch.mask is None:
             return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=self.basis.device)
         return batch.mask.all(-1)
-
-    def _latents(self, drawn: dict[str, Tensor]) -> Latents:
-        start = self.embed(drawn["start"]) if self.goal_scaling else None
-        goal = self.embed(drawn["goal"])
-        return Latents(
-            w=self.scaled(drawn["w"], goal, start),
-            plan=Plan.of(drawn),
-            goal=goal,
-            position=self.embed(drawn["z"][:, :, 0]),
-            velocity=self.config.velocity_scale * drawn["velocity"],
-        )
 
     def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
         """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
@@ -130,7 +146,7 @@ class LatentPathPrior(LatentDmp):
         )
 
     def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
-        """p(z*_{1:length} | frames seen)."""
+        """p(z*_{1:length} | frames observed)."""
         seen = batch.values.shape[1]
         if self.phased:
             check_end(self.label, self.frames, seen, length - seen)
@@ -179,8 +195,3 @@ def _variances(u: Float[Tensor, "movement row latent"]) -> Float[Tensor, "row la
 def _is_one_section(mask: Bool[Tensor, "sequence time channel"]) -> bool:
     """Whether only whole frames are missing, the same of every movement."""
     return bool((mask == mask[:1, :, :1]).all())
-
-
-def observed(batch: Batch) -> Bool[Tensor, "window time channel"]:
-    """Which entries were observed."""
-    return torch.ones_like(batch.values, dtype=torch.bool) if batch.mask is None else batch.mask

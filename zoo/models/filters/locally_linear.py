@@ -10,7 +10,7 @@ from zoo.nn.mlp import mlp
 
 __all__ = ["LocallyLinear"]
 
-SPREAD = 0.02
+STD = 0.02
 
 
 class LocallyLinear(nn.Module):
@@ -38,11 +38,11 @@ class LocallyLinear(nn.Module):
         """Matrices and their weights for ``latent`` coordinates and ``controls`` actions."""
         super().__init__()
         eye = torch.eye(latent).expand(bases, latent, latent)
-        self.A = nn.Parameter(eye + SPREAD * torch.randn(bases, latent, latent))
+        self.A = nn.Parameter(eye + STD * torch.randn(bases, latent, latent))
         self.C = nn.Parameter(noise_scale * eye.clone())
         self.controls = controls
         if controls:
-            self.B = nn.Parameter(SPREAD * torch.randn(bases, controls, latent))
+            self.B = nn.Parameter(STD * torch.randn(bases, controls, latent))
         self.weights = mlp([latent + controls, hidden, bases], "tanh")
 
     def forward(

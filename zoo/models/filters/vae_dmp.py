@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pyro
 import pyro.distributions as dist
 import torch
@@ -11,22 +9,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zoo.contract.readiness import need
-from zoo.inference.laplace import laplace
+from zoo.models.filters.latent_changes import LatentChanges
 from zoo.models.filters.latent_dmp import Config
-from zoo.models.filters.latent_path_prior import PRIOR_DRAWS, LatentPathPrior, observed
-from zoo.movement.components import ramp
+from zoo.models.filters.latent_path_prior import LatentPathPrior
 from zoo.movement.lengths import check_whole
-from zoo.movement.plan import Latents, Plan
+from zoo.movement.plan import Plan
 from zoo.movement.response import Response
 from zoo.prediction.predictive import Predictive
-from zoo.types import Batch, Posterior, Wishes
+from zoo.types import Batch, Posterior
 
 __all__ = ["Config", "VaeDmp"]
 
-GOAL_SLACK = 1e-2
 
-
-class VaeDmp(LatentPathPrior):
+class VaeDmp(LatentPathPrior, LatentChanges):
     r"""Movements as latent DMPs with process noise, decoded frame by frame (thesis §6.2).
 
     With s = (z*, ż), β = α/4 and dt = 1/(n − 1)::
@@ -86,111 +81,87 @@ class VaeDmp(LatentPathPrior):
             start=pyro.sample("start", unit) if self.goal_scaling else None,
         )
 
+    def noise_gain(self) -> Float[Tensor, "latent state"]:
+        """G: ε = ε̂ w_ε enters the next state as (77) says."""
+        return (self.system.stiffness * self.w_noise) @ self.step_input
+
+    def initial_state(
+        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
+    ) -> Float[Tensor, "window state"]:
+        """(z*_1, ż_1) of a window's first frame."""
+        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
+
+    def forces(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window latent"]:
+        """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
+        steps = batch.values.shape[1] - 1
+        goal = self.embed(plan.goal)
+        w = self.scaled(plan.w, goal, None if plan.start is None else self.embed(plan.start))
+        pull = goal + self.forcing(w, plan)
+        at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
+        row = at * pull.shape[1] + batch.sequence
+        picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
+        return picked.view(steps, len(batch), -1)
+
+    def forcing(
+        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
+    ) -> Float[Tensor, "step sequence latent"]:
+        """f_t in units of αβ of every step of whole movements, time-major."""
+        return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+
+    def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
+        """What goal and forcing term add to the state in every step, (77)."""
+        return self.forces(plan, batch) @ self.step_input
+
+    def path(
+        self,
+        z: Float[Tensor, "window latent"],
+        velocity: Float[Tensor, "window latent"],
+        plan: Plan,
+        ε: Float[Tensor, "window step latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "window time latent"]:
+        """z*_{1:T} by the linear response of (75): no loop over time."""
+        steps = batch.values.shape[1]
+        response = Response.of(self.system, steps, z.dtype, z.device)
+        noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
+        force = self.forces(plan, batch) + noise
+        begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
+        states = response.product(begin.flatten(1), force.flatten(1))
+        return states[0].view(steps, len(batch), -1).transpose(0, 1)
+
+    def paths(
+        self,
+        z: Float[Tensor, "*sample window time latent"],
+        velocity: Float[Tensor, "*sample window latent"],
+        plan: Plan,
+        ε: Float[Tensor, "*sample window step latent"],
+        batch: Batch,
+    ) -> Float[Tensor, "*sample window time latent"]:
+        """The paths of every draw of the program's sites, such as Pyro's vectorised particles."""
+        lead = z.shape[:-3]
+        if not lead:
+            return self.path(z[:, 0], velocity, plan, ε, batch)
+        parts = zip(
+            z.flatten(0, -4), velocity.flatten(0, -3), plan.draws(), ε.flatten(0, -4), strict=True
+        )
+        found = [self.path(z[:, 0], v, p, ε, batch) for z, v, p, ε in parts]
+        paths: Tensor = torch.stack(found).unflatten(0, lead)
+        return paths
+
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Paths z* with the recognised noise."""
-        return Predictive(location=self._posterior_paths(batch, posterior, draws), joint=True)
+        return Predictive(location=self._recognised(batch, posterior, draws), joint=True)
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Whole movements through the DMP with the recognised w, goal, start and noise."""
-        return self.decode(self._posterior_paths(batch, posterior, draws))
+        return self.decode(self._recognised(batch, posterior, draws))
 
-    def forecast(
-        self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
-    ) -> Predictive:
-        """Joint draws of the future, given the encoded frames seen; phase 0 is the first frame."""
-        seen = batch.values.shape[1]
-        paths = self._conditioned(batch, need(posterior), seen + horizon).sample(draws)
-        return self.decode(paths[:, :, seen:])
-
-    def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """Joint draws of whole movements given the entries seen."""
-        paths = self._conditioned(batch, need(posterior), batch.values.shape[1]).sample(draws)
-        return self.decode(paths)
-
-    def generate(
-        self,
-        batch: Batch,
-        posterior: Posterior | None,
-        *,
-        wishes: Wishes,
-        draws: int,
-    ) -> Predictive:
-        """Goal changes (§6.2.5), other durations and switching (89), with noise from its prior."""
-        guide, goal, duration = need(posterior), wishes.goal, wishes.duration
-        here = self._latents(guide.draw(batch, draws))
-        if goal is not None:
-            here = self._aimed(here, self._goal(goal, guide, draws))
-        pull, position, velocity = self._pull(here, duration), here.position, here.velocity
-        if goal is not None and self.phased:
-            pull = self._ended(here, pull, duration)
-        if wishes.onto is not None:
-            there = self._pull(self._latents(guide.draw(wishes.onto, draws)), duration)
-            η = ramp(pull.shape[-2] + 1, wishes.start, wishes.steps)[:, None]
-            pull = torch.lerp(pull, there, η.to(pull))
-        noise = torch.randn_like(pull) @ self.w_noise
-        system = replace(self.system, tau=duration)
-        response = Response.of(system, pull.shape[-2] + 1, pull.dtype, pull.device)
-        rest = torch.zeros_like(position)
-        force = system.stiffness * (pull + noise)
-        return self.decode(response.states(position, velocity / duration, rest, force)[0])
-
-    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
-        """σ of movements that no network was trained on, never below what training found.
-
-        σ² = E_q (x − μ(g(z)))² is what maximises their bound (80); a decoder fits the frames that
-        it was trained on better than others.
-        """
-        z = posterior.encode(batch.values, batch.mask).sample((PRIOR_DRAWS,))
-        error = (self.decoder(self.embed(z)) - batch.values).square().mean(0)
-        mask = observed(batch)
-        mean = (error * mask).sum((0, 1)) / mask.sum((0, 1)).clamp(min=1)
-        std = torch.maximum(mean.sqrt(), self.output_std)
-        self.output_root.copy_((std - self.config.output_floor).sqrt())
-
-    def _pull(self, found: Latents, duration: float) -> Float[Tensor, "sample sequence step d"]:
-        """z^goal + σ_w Ψ w at every step: the forces in units of αβ."""
-        steps = round((self.frames - 1) * duration)
-        basis = self.config.w_scale * self.kernels_at(steps, duration).to(found.w)
-        return found.goal.unsqueeze(2) + basis @ found.w
-
-    def _goal(self, x: Tensor, guide: Posterior, draws: int) -> Tensor:
-        """z* of frames to end at, by the decoder: an encoder knows only frames like its own."""
-        start = guide.encode(x).mean
-        known = laplace(lambda z: self.decoder(self.embed(z)), start, x, self.output_std)
-        return self.embed(known.sample((draws,)))
-
-    def _aimed(self, found: Latents, goal: Float[Tensor, "sample sequence d"]) -> Latents:
-        """Another goal, the forcing term multiplied by (g − y_0)/(g_fit − y_0), §6.2.5."""
-        if self.goal_scaling:
-            return replace(found, w=self.scaled(found.plan.w, goal, found.position), goal=goal)
-        old, new = found.goal - found.position, goal - found.position
-        ratio = (new * old + GOAL_SLACK) / (old.square() + GOAL_SLACK)
-        return replace(found, w=found.w * ratio.unsqueeze(2), goal=goal)
-
-    def _ended(
-        self, found: Latents, pull: Float[Tensor, "sample sequence step d"], duration: float
-    ) -> Float[Tensor, "sample sequence step d"]:
-        """The attractor moved so that the path without noise ends at the goal, not on its way."""
-        system = replace(self.system, tau=duration)
-        response = Response.of(system, pull.shape[-2] + 1, pull.dtype, pull.device)
-        rest, force = torch.zeros_like(found.position), system.stiffness * pull
-        path = response.states(found.position, found.velocity / duration, rest, force)[0]
-        ones = system.stiffness * pull.new_ones(pull.shape[-2], 1)
-        gain = response.product(pull.new_zeros(2, 1), ones)[0][-1]
-        return pull + ((found.goal - path[..., -1, :]) / gain).unsqueeze(2)
-
-    def _paths(self, drawn: dict[str, Tensor], batch: Batch, draws: int) -> Tensor:
+    def _recognised(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
+        """Draws of the paths of whole movements."""
+        check_whole(self.label, self.frames, batch.values.shape[1])
+        drawn = need(posterior).draw(batch, draws)
         flat = {name: value.flatten(0, 1) for name, value in drawn.items()}
         first, velocity, ε = flat["z"][:, 0], flat["velocity"], flat["epsilon"]
         path = self.path(first, velocity, Plan.of(flat), ε, batch.repeat(draws))
         split: Tensor = path.unflatten(0, (draws, len(batch)))
         return split
-
-    def _posterior_paths(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
-        check_whole(self.label, self.frames, batch.values.shape[1])
-        return self._paths(need(posterior).draw(batch, draws), batch, draws)
-
-    def decode(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
-        """p(x_t | z*_t)."""
-        location = self.decoder(paths.to(self.output_root))
-        return Predictive(location=location, noise=self.output_std, joint=True)

@@ -17,13 +17,12 @@ from zoo.contract.settings import Positive, settings
 from zoo.datasets.records import Sequences
 from zoo.errors import NotFittedError
 from zoo.models.filters import latent_dmp
-from zoo.models.filters.latent_dmp import ALPHA_FRAME
-from zoo.models.filters.latent_path_prior import PRIOR_DRAWS, observed
+from zoo.models.filters.cycles import CyclePrior
+from zoo.models.filters.latent_path_prior import PRIOR_DRAWS
 from zoo.models.filters.vae_dmp import VaeDmp
-from zoo.movement.cycles import CyclePrior
-from zoo.movement.demonstrations import extremes
+from zoo.movement.demonstrations import extremes, seen_entries
 from zoo.movement.plan import Latents, Plan
-from zoo.movement.response import Response, rhythmic_basis
+from zoo.movement.response import ALPHA_FRAME, Response, rhythmic_basis
 from zoo.movement.timing import period_of, tempos
 from zoo.types import Batch, Layout, Posterior
 
@@ -67,11 +66,11 @@ class RhythmicVaeDmp(VaeDmp):
     *Dynamical movement primitives*, Neural Computation 25 (2013).
 
     Forecasts and imputation are those of a latent path prior, not of the program's p(w), p(φ): they
-    condition a mixture over limit cycles, the weights and centres of the
-    training movements, at every phase and at tempos like those found, with what their cycles leave
-    as a stationary process (:class:`~zoo.movement.cycles.CyclePrior`). Another goal is another
-    centre; another duration stretches the period. Movements must have one common length; a forecast
-    may start in any phase, and go on for any time.
+    condition a mixture over limit cycles, the weights and centres of the training movements, at
+    every phase and at tempos like those found, with what their cycles leave as a stationary process
+    (:class:`~zoo.models.filters.cycles.CyclePrior`). Another goal is another centre; another
+    duration stretches the period. Movements must have one common length; a forecast may start in
+    any phase, and go on for any time.
     """
 
     config_class: ClassVar[type] = Config
@@ -137,7 +136,7 @@ class RhythmicVaeDmp(VaeDmp):
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
         """Keep weights, centres and timings of the training movements, and what they leave."""
-        self.reached = extremes(batch.values, observed(batch))
+        self.reached = extremes(batch.values, seen_entries(batch))
         drawn = posterior.draw(batch, PRIOR_DRAWS)
         found = self._latents(drawn)
         rows = torch.cat([found.w, found.goal.unsqueeze(2)], dim=2)
@@ -175,8 +174,7 @@ class RhythmicVaeDmp(VaeDmp):
             movements.double(),
             residuals.double(),
             observation.double().mean(0),
-            *self.prior_shape.tolist(),
-        )
+        ).shaped(self.prior_shape.tolist())
 
     def _cycles(
         self, timings: Float[Tensor, "timing 2"], length: int

@@ -25,8 +25,8 @@ class Config:
     """Settings of :class:`PCA`.
 
     ``noise_floor`` is the least σ in scaled units, for data of lower rank than they have channels;
-    ``em_iterations`` and ``em_tolerance`` (nats per observed entry) end EM where entries
-    are missing.
+    ``em_iterations`` and ``em_tolerance`` (nats per observed entry) end EM where entries are
+    missing.
     """
 
     latent_dim: Count = 5
@@ -42,9 +42,9 @@ class PCA(nn.Module):
 
     Thesis §4.3.2 and Table 2; Tipping & Bishop, *Probabilistic principal component analysis*,
     JRSS B 61 (1999). Maximum likelihood comes from the eigen-decomposition of the covariance;
-    with missing entries from EM on the entries seen. Frames are independent items. Evidence,
+    with missing entries from EM on the entries observed. Frames are independent items. Evidence,
     posterior, reconstruction and the conditional of missing joints given seen ones are exact;
-    entries that were seen get their reconstruction. W, μ and σ are point estimates: their own
+    entries that were observed get their reconstruction. W, μ and σ are point estimates: their own
     uncertainty is not in the bands. It knows nothing of time, so that it gives no forecast, and a
     frame with nothing seen gets the marginal N(μ, WW' + σ²I).
 
@@ -119,12 +119,12 @@ class PCA(nn.Module):
         """p(x̂_t | x_t) of a second observation of the same frame, exact."""
         f = self.factors()
         mean, covariance = self._posterior(batch)
-        spread = torch.einsum("di,stij,dj->std", f.loading, covariance, f.loading)
+        variance = torch.einsum("di,stij,dj->std", f.loading, covariance, f.loading)
         z = dist.MultivariateNormal(mean, covariance).sample((draws,))
         return Predictive(
             location=(mean @ f.loading.T + f.mean)[None],
             noise=f.noise,
-            epistemic=spread.sqrt()[None],
+            epistemic=variance.sqrt()[None],
             draws=z @ f.loading.T + f.mean,
         )
 
@@ -134,7 +134,7 @@ class PCA(nn.Module):
         return Predictive(location=z @ f.loading.T + f.mean, noise=f.noise, joint=True)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """p(x_missing | x_seen), the exact Gaussian conditional; seen entries reconstructed."""
+        """p(x_missing | x_seen), the exact Gaussian conditional; observed entries reconstructed."""
         return self.reconstruct(batch, posterior, draws=draws)
 
     def _fit(self, values: Tensor, mask: Tensor) -> Factors:

@@ -53,8 +53,8 @@ class VAE(nn.Module):
     leaves the activation open: ReLU here. Frames are independent items. Missing entries are left
     out of the likelihood and are 0 to the encoder; predictions of frames with missing entries
     come from a Markov chain through encoder and decoder, whose Metropolis step corrects the
-    encoder. Entries that were seen get their reconstruction. The networks are point estimates. It
-    knows nothing of time, so that it gives no forecast, and a frame with nothing seen gets draws
+    encoder. Entries that were observed get their reconstruction. The networks are point estimates.
+    It knows nothing of time, so that it gives no forecast, and a frame with nothing seen gets draws
     of the prior.
 
     Defaults: 5 coordinates, hidden 512, σ(z) of the state (the entry takes a constant for each
@@ -93,7 +93,7 @@ class VAE(nn.Module):
         return x
 
     def explained(self, batch: Batch) -> tuple[int, Bool[Tensor, "window time"] | None]:
-        """Leading frames that have a latent state, and which of them anything was seen of."""
+        """Leading frames that have a latent state, and which of them anything was observed of."""
         seen = None if batch.mask is None else batch.mask.any(-1)
         return batch.values.shape[1], seen
 
@@ -113,7 +113,7 @@ class VAE(nn.Module):
         return Predictive(location=mean, noise=std, joint=True)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """p(x_missing | x_seen) by the Markov chain; entries that were seen reconstructed."""
+        """p(x_missing | x_seen) by the Markov chain; entries that were observed reconstructed."""
         return self.reconstruct(batch, posterior, draws=draws)
 
     def _latents(

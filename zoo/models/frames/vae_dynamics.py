@@ -96,7 +96,7 @@ class VAEDynamics(nn.Module):
         return x
 
     def explained(self, batch: Batch) -> tuple[int, Bool[Tensor, "window time"] | None]:
-        """Leading frames that have a latent state, and those whose successor was seen."""
+        """Leading frames that have a latent state, and those whose successor was observed."""
         frames = batch.values.shape[1]
         if frames < 2:
             raise ValueError(f"vae-dynamics needs windows of at least 2 frames; got {frames}")
@@ -173,7 +173,7 @@ class VAEDynamics(nn.Module):
     def _encode(
         self, values: Tensor, mask: Tensor | None, posterior: Posterior | None
     ) -> torch.distributions.Normal:
-        """q(z_t | x_t); the prior where nothing was seen."""
+        """q(z_t | x_t); the prior where nothing was observed."""
         if posterior is None:
             raise NotFittedError("vae-dynamics needs its guide to predict; got no posterior")
         q = posterior.encode(values, mask)

@@ -79,7 +79,7 @@ class AeDmp(nn.Module):
     reconstructions and new movements hold the one σ of all channels alone, which is learned, and
     estimated again on movements that the networks were not trained on, where there are any.
     Forecasts and missing sections condition a mixture around the latent paths of the training
-    movements on the frames seen (:class:`~zoo.movement.paths.PathPrior`), with draws; after
+    movements on the frames observed (:class:`~zoo.movement.paths.PathPrior`), with draws; after
     training on a single movement it is as wide as that movement's own θ. Missing joints come from
     the chain of §5.3.4, frame by frame, and the primitive nearest to the path it finds, which the
     thesis leaves out. Movements must have one common length.
@@ -150,11 +150,11 @@ class AeDmp(nn.Module):
     def imitate(
         self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None
     ) -> Float[Tensor, "window parameter latent"]:
-        """θ of the roll-outs nearest to ``path`` where it was seen."""
+        """θ of the roll-outs nearest to ``path`` where it was observed."""
         return self.imitator.fit(path, seen)
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """Roll-outs ỹ of the movements in the latent space, without a spread."""
+        """Roll-outs ỹ of the movements in the latent space, without their uncertainty."""
         return Predictive(location=self.imitator.roll_out(self._imitated(batch, posterior))[None])
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
@@ -183,7 +183,7 @@ class AeDmp(nn.Module):
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
     ) -> Predictive:
-        """Roll-outs given the encoded frames seen; phase 0 is the first frame."""
+        """Roll-outs given the encoded frames observed; phase 0 is the first frame."""
         y, seen = self._encoded(batch, posterior)
         known = y.shape[1]
         return self.decode(self._completed(y, seen, known + horizon, draws)[:, :, known:])
@@ -254,14 +254,14 @@ class AeDmp(nn.Module):
         length: int,
         draws: int,
     ) -> Float[Tensor, "sample sequence frame latent"]:
-        """Draws of paths of ``length`` frames given the latent frames seen."""
+        """Draws of paths of ``length`` frames given the latent frames observed."""
         check_end(self.label, self.frames, y.shape[1], length - y.shape[1])
         return self._prior(length).completed(y, seen, draws)
 
     def _encoded(
         self, batch: Batch, posterior: Posterior | None
     ) -> tuple[Float[Tensor, "sequence time latent"], Bool[Tensor, "sequence time"]]:
-        """Latent frames, missing joints filled by passing them k times; frames seen at all."""
+        """Latent frames, missing joints filled by passing them k times; frames observed at all."""
         guide, x = need(posterior), batch.values
         if batch.mask is None:
             return guide.encode(x).mean, torch.ones_like(x[..., 0], dtype=torch.bool)

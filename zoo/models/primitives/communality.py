@@ -1,10 +1,12 @@
-"""What of every channel the other channels cannot tell of movements left out."""
+"""What of every channel the other channels cannot tell of held-out movements."""
 
 from __future__ import annotations
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from zoo.movement.cross_validation import held_out_errors
 
 __all__ = ["blocks", "unshared"]
 
@@ -14,7 +16,7 @@ LEAST = 0.02
 
 
 def blocks(channels: int) -> Int[Tensor, " channel"]:
-    """Neighbouring channels that are left out together.
+    """Neighbouring channels that are held out together.
 
     >>> blocks(7).tolist()
     [0, 0, 1, 2, 2, 3, 4]
@@ -39,18 +41,8 @@ def unshared(
         others, own = scaled[:, block != b].flatten(1), scaled[:, block == b].flatten(1)
         kernel = others @ others.mT * (count / max(1, int((block != b).sum())))
         values, vectors = torch.linalg.eigh(kernel)
-        errors = [_left_out(values / (values + r), vectors, own) for r in RIDGES]
+        rest = [(vectors * (r / (values + r))) @ vectors.mT - 1 / count for r in RIDGES]
+        errors = [held_out_errors(m, own, torch.arange(count)).square().sum(0) for m in rest]
         found.append(torch.stack(errors).unflatten(1, (int((block == b).sum()), -1)).sum(2))
     each = torch.cat(found, dim=1) * ((count - 1) / count) ** 2
     return each[each.sum(1).argmin()].clamp(LEAST, 1 - LEAST)
-
-
-def _left_out(
-    kept: Float[Tensor, " sequence"],
-    vectors: Float[Tensor, "sequence sequence"],
-    own: Float[Tensor, "sequence entry"],
-) -> Float[Tensor, " entry"]:
-    """Square errors, summed over movements, each predicted by the others and their mean."""
-    hat = (vectors * kept) @ vectors.mT + 1 / len(own)
-    error = (own - hat @ own) / (1 - hat.diagonal()).clamp_min(1e-6)[:, None]
-    return error.square().sum(0)

@@ -1,4 +1,4 @@
-"""Settings chosen by movements left out, of which nothing is used before they are judged."""
+"""Settings chosen by held-out movements, of which nothing is used before they are judged."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from torch import Tensor
 from torch.distributions import StudentT
 
 from zoo.models.primitives.alignment import BasisOf
-from zoo.models.primitives.weight_learning import Noise, Single, View
+from zoo.models.primitives.weight_learning import EntryNoise, Single, View
 from zoo.models.primitives.weights import Basis, Weights
-from zoo.movement.rollout import Timing
-from zoo.movement.sufficient_statistics import Movements
+from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
+from zoo.movement.timing import Expected, Movements
 
-__all__ = ["Choice", "Prepared", "choose", "inflation"]
+__all__ = ["Prepared", "WeightShrinkage", "choose", "inflation"]
 
 SHARES = (0.5, 0.003, 0.01, 0.03, 0.1, 0.2, 0.35, 0.7, 0.9)
 INFORMATIONS = (1.0, 0.1, 0.03, 0.01, 0.003)
-FOLDS = 4
 LEAST = 16
 JUDGED = 2
 CANDIDATES = 2
@@ -28,7 +27,7 @@ FRAMES = 12
 
 
 @dataclass(frozen=True)
-class Choice:
+class WeightShrinkage:
     """The share of the prior in Σ, and what part of an independent observation an entry counts."""
 
     share: float = SHARES[0]
@@ -44,7 +43,7 @@ class Prepared:
     offset: Float[Tensor, " channel"]
     views: list[View]
     single: Single
-    expected: list[Timing]
+    expected: Expected
 
     def centred(self, values: Tensor, seen: Tensor) -> Tensor:
         """Values about the offset, 0 where nothing was observed."""
@@ -52,8 +51,8 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class _Left:
-    """A movement left out: its first quarter at a few timings, and some of the later frames."""
+class _HeldOut:
+    """A held-out movement: its first quarter at a few timings, and some of the later frames."""
 
     begun: list[View]
     later: list[Basis]
@@ -67,26 +66,26 @@ def choose(
     group: Int[Tensor, " sequence"],
     share: float | None,
     information: float | None,
-) -> Choice:
-    """The settings under which movements left out are most probable after their first quarter.
+) -> WeightShrinkage:
+    """The settings under which held-out movements are most probable after their first quarter.
 
     ``prepare`` makes everything anew, from the movements that stay, for each of at most four folds
-    of groups: alignment, synergies, mean, noise and prior never depend on those left out. These
+    of groups: alignment, synergies, mean, noise and prior never depend on those held out. These
     are judged by the mean log marginal density of their later entries. The prior counts 16/n
     movements at least. Fewer than three groups leave the first of the settings.
     """
     least = LEAST / (LEAST + len(group.unique()) ** 2)
     shares = tuple(s for s in SHARES if s >= least) if share is None else (share,)
     informations = INFORMATIONS if information is None else (information,)
+    start = WeightShrinkage(shares[0], informations[0])
     if len(shares) * len(informations) == 1 or len(group.unique()) < 3:
-        return Choice(shares[0], informations[0])
+        return start
     folds = list(_folds(prepare, movements, group))
 
-    def density(choice: Choice) -> float:
-        return sum(float(_density(*fold, choice)) for fold in folds)
+    def density(shrinkage: WeightShrinkage) -> float:
+        return sum(float(_density(*fold, shrinkage)) for fold in folds)
 
-    first = max((Choice(shares[0], i) for i in informations), key=density)
-    return max((Choice(s, first.information) for s in shares), key=density)
+    return chosen_in_turn(start, [("information", informations), ("share", shares)], density)
 
 
 def inflation(groups: int) -> float:
@@ -97,18 +96,16 @@ def inflation(groups: int) -> float:
 
 def _folds(
     prepare: Callable[[Sequence[int]], Prepared], movements: Movements, group: Tensor
-) -> Iterator[tuple[Prepared, int, list[_Left]]]:
-    names, fold = group.unique(return_inverse=True)
-    fold = fold % min(FOLDS, len(names))
-    for k in range(min(FOLDS, len(names))):
-        inside, outside = (fold != k).nonzero()[:, 0], (fold == k).nonzero()[:, 0]
+) -> Iterator[tuple[Prepared, int, list[_HeldOut]]]:
+    for _, held in splits(folds_of(group)):
+        inside, outside = (~held).nonzero()[:, 0], held.nonzero()[:, 0]
         prepared = prepare(inside.tolist())
         judged = [movements[i] for i in outside[:JUDGED].tolist()]
-        left = [_left(prepared, values, seen) for values, seen in judged]
+        left = [_held_out(prepared, values, seen) for values, seen in judged]
         yield prepared, len(group[inside].unique()), left
 
 
-def _left(prepared: Prepared, values: Tensor, seen: Tensor) -> _Left:
+def _held_out(prepared: Prepared, values: Tensor, seen: Tensor) -> _HeldOut:
     """Timings are the nearest ones to the first quarter of all that are expected."""
     frames, begin = len(values), max(2, len(values) // 4)
     if begin >= frames:
@@ -116,13 +113,13 @@ def _left(prepared: Prepared, values: Tensor, seen: Tensor) -> _Left:
     early = torch.arange(frames)[:, None] < begin
     x = prepared.centred(values, seen)
     template = prepared.single.weights.mean.mean(0)
-    bases = [prepared.basis(frames, timing) for timing in prepared.expected]
+    bases = [prepared.basis(frames, timing) for timing in prepared.expected.timings]
     paths = torch.stack([Basis(b.phases[:begin], b.synergies).path(template) for b in bases])
     error = ((x[:begin] - paths) * seen[:begin]).square().sum((1, 2))
     near = error.topk(min(CANDIDATES, len(bases)), largest=False).indices.tolist()
     rows, some = torch.zeros(1, dtype=torch.long), torch.linspace(begin, frames - 1, FRAMES)
     later = some.round().long().unique()
-    return _Left(
+    return _HeldOut(
         [View(rows, bases[i], seen & early, (x * early)[None]) for i in near],
         [Basis(bases[i].phases[later], bases[i].synergies) for i in near],
         x[later],
@@ -130,15 +127,17 @@ def _left(prepared: Prepared, values: Tensor, seen: Tensor) -> _Left:
     )
 
 
-def _density(prepared: Prepared, groups: int, left: list[_Left], choice: Choice) -> Tensor:
+def _density(
+    prepared: Prepared, groups: int, left: list[_HeldOut], shrinkage: WeightShrinkage
+) -> Tensor:
     """Mean log density of the later entries under a t of n − 1 degrees of freedom."""
-    prior = prepared.single.population(choice.share).scaled(inflation(groups))
-    noise = Noise(prepared.single.variance, choice.information)
+    prior = prepared.single.population(shrinkage.share).scaled(inflation(groups))
+    noise = EntryNoise(prepared.single.variance, shrinkage.information)
     scores = [_of_one(prior, noise, movement, groups - 1) for movement in left]
     return torch.stack(scores).sum()
 
 
-def _of_one(prior: Weights, noise: Noise, movement: _Left, degrees: int) -> Tensor:
+def _of_one(prior: Weights, noise: EntryNoise, movement: _HeldOut, degrees: int) -> Tensor:
     evidence, density = [], []
     for begun, later in zip(movement.begun, movement.later, strict=True):
         evidence.append(begun.log_density(prior, noise)[0, 0])

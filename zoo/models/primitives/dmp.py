@@ -15,15 +15,16 @@ from torch import Tensor
 from torch.nn import functional
 
 from zoo.datasets.records import Sequences
-from zoo.models.primitives.cases import Case, Posteriors
 from zoo.models.primitives.goals import aimed, recentred
 from zoo.models.primitives.learned_dmp import COMPONENTS, Config, LearnedDmp
-from zoo.models.primitives.learning import learn
-from zoo.models.primitives.movement_law import MovementLaw, Noise
+from zoo.models.primitives.learning import learn_parameters
+from zoo.models.primitives.movement_law import MovementLaw, ResidualNoise
+from zoo.models.primitives.parameter_hypotheses import AtTiming, ParameterPosterior
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import roll_out
 from zoo.movement.components import Components, Paths, minimum_jerk, ramp
 from zoo.movement.demonstrations import extremes, seen_entries, seen_movements
-from zoo.movement.rollout import Timing, roll_out
+from zoo.movement.timing import Timing
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Posterior, Sites, Wishes
 
@@ -53,8 +54,8 @@ class DMP(LearnedDmp):
     together over joints and time: below 1 its posterior is a generalised (tempered) one, not Bayes'
     (Bissiri, Holmes & Walker, *A general framework for updating belief distributions*, JRSS B 78,
     2016). What a channel has in V and not in L is the share that a ridge on the other channels
-    cannot tell of movements left out. Information and the share of independent parameters in V are
-    those under which single entries of movements left out are most probable, later ones after the
+    cannot tell of held-out movements. Information and the share of independent parameters in V are
+    those under which single entries of held-out movements are most probable, later ones after the
     first quarter and those of a block of channels given the others; with fewer than three movements
     information is 1 and the shares are one half. Timings, noise and that share of a channel are
     learned from all movements before.
@@ -79,7 +80,7 @@ class DMP(LearnedDmp):
     def condition(self, data: Sequences) -> None:
         """Learn p(θ), the noise, and the durations or the period of the movements."""
         period = None if self.config.period is None else self.config.period * data.rate
-        found = learn(
+        found = learn_parameters(
             self.primitive, self.config.learning, period, data.values, data.mask, data.lengths
         )
         self._keep("reached", extremes(data.values, data.mask))
@@ -103,7 +104,7 @@ class DMP(LearnedDmp):
 
     def prior(self, batch: Batch) -> tuple[MovementLaw, Tensor]:
         """Draw timing, scale and θ of the movements: p(x | θ, timing), and R θ."""
-        frames, timings = batch.movements.shape[1], self._whole(batch.movements.shape[1])
+        frames, timings = batch.movements.shape[1], self.expected.whole(batch.movements.shape[1])
         designs = torch.stack([roll_out(self.primitive, frames, t) for t in timings])
         timing = pyro.sample("timing", dist.Categorical(torch.ones_like(designs[:, 0, 0])))
         s = self.scales[pyro.sample("scale", dist.Categorical(torch.ones_like(self.scales)))]
@@ -113,7 +114,7 @@ class DMP(LearnedDmp):
             a = self._white("shared", self.factors.shape[-1])
             deviation = deviation + torch.einsum("cpr,...r->...cp", self.factors, a)
         θ = self.mean + s[..., None, None] * deviation
-        noise = Noise(self.noise, self.ratio)
+        noise = ResidualNoise(self.noise, self.ratio)
         law = MovementLaw(self.primitive, timings, noise, timing, θ, seen_movements(batch))
         path: Tensor = θ @ designs[timing].mT
         return law, path.mT
@@ -121,7 +122,7 @@ class DMP(LearnedDmp):
     def posterior_sites(self, batch: Batch) -> Sites:
         """p(timing, scale, θ | x), exactly, each entry counted as ``information`` of one."""
         x, seen = batch.movements, seen_movements(batch)
-        given = Posteriors(self._given(self._whole(x.shape[1])), x, seen)
+        given = ParameterPosterior(self._given(self.expected.whole(x.shape[1])), x, seen)
         of = {"timing": given.timing, "scale": given.scale}
         if self.factors.shape[-1]:
             of["shared"] = given.shared
@@ -132,14 +133,15 @@ class DMP(LearnedDmp):
         """Fresh roll-outs of the weights, goal and first state that the movements have."""
         self._check_fitted()
         frames = batch.values.shape[1]
-        given, anew = self._given(self._whole(frames)), partial(self._roll_outs.anew, frames=frames)
+        given = self._given(self.expected.whole(frames))
+        anew = partial(self._roll_outs.anew, frames=frames)
         parts = given.mixture(batch.values, seen_entries(batch), 1, anew)
         return self._as_predictive(parts, draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """The paths given the entries seen."""
+        """The paths given the entries observed."""
         self._check_fitted()
-        timings = self._whole(batch.values.shape[1])
+        timings = self.expected.whole(batch.values.shape[1])
         parts = self._filled(batch.values, seen_entries(batch), timings)
         return self._as_predictive(parts, draws)
 
@@ -151,7 +153,7 @@ class DMP(LearnedDmp):
         pad = (0, 0, 0, horizon)
         values, seen = functional.pad(batch.values, pad), functional.pad(seen_entries(batch), pad)
         known = batch.values.shape[1]
-        parts = self._filled(values, seen, self._timings(known))
+        parts = self._filled(values, seen, self.expected.lasting(known))
         return self._as_predictive(parts.after(known), draws)
 
     def generate(
@@ -177,42 +179,41 @@ class DMP(LearnedDmp):
         blend = ramp(frames, wishes.start, wishes.steps) if other else still
         rolled = self._roll_outs
 
-        def mix(i: int, case: Case) -> Paths:
-            timing = Timing(case.timing.unit * duration, case.timing.offset)
-            terms = [(rolled.part(timing, 1 - blend, begin=True), case.population)]
+        def mix(i: int, at: AtTiming) -> Paths:
+            timing = Timing(at.timing.unit * duration, at.timing.offset)
+            terms = [(rolled.part(timing, 1 - blend, begin=True), at.population)]
             if other:
                 phase = Timing(timing.unit, other[i].timing.offset)
                 terms.append((rolled.part(phase, blend, begin=False), other[i].population))
             if goal is not None:
-                moved, rest = self._moved(other[i] if other else case, goal[i])
+                moved, rest = self._moved(other[i] if other else at, goal[i])
                 terms[-1] = (terms[-1][0], moved)
                 terms.append((minimum_jerk(frames, wishes.start)[:, None], Population.fixed(rest)))
             return rolled.summed(terms, timing)
 
-        parts = [mix(i, case) for i, case in enumerate(self._demonstrated(batch, len(batch)))]
+        parts = [mix(i, at) for i, at in enumerate(self._demonstrated(batch, len(batch)))]
         return self._as_predictive(Components.of(parts), draws)
 
     def _filled(self, values: Tensor, seen: Tensor, timings: list[Timing]) -> Components:
-        alone = len(timings) * len(self.scales) == 1
-        given, follow = self._given(timings), self._roll_outs.followed
-        return given.mixture(values, seen, 1 if alone else COMPONENTS, follow)
+        given = self._given(timings)
+        return given.mixture(values, seen, given.at_most(COMPONENTS), self._roll_outs.followed)
 
-    def _demonstrated(self, batch: Batch, count: int) -> list[Case]:
+    def _demonstrated(self, batch: Batch, count: int) -> list[AtTiming]:
         """The likeliest timing of every movement and its posterior."""
         if len(batch) not in (1, count):
             raise ValueError(f"onto has {len(batch)} movements; 1 or {count} are needed")
-        given = self._given(self._whole(batch.values.shape[1]))
-        cases = given.demonstrated(batch.values, seen_entries(batch))
-        return [cases[i if len(batch) == count else 0] for i in range(count)]
+        given = self._given(self.expected.whole(batch.values.shape[1]))
+        found = given.demonstrated(batch.values, seen_entries(batch))
+        return [found[i if len(batch) == count else 0] for i in range(count)]
 
     def _moved(
-        self, case: Case, goal: Float[Tensor, " channel"]
+        self, at: AtTiming, goal: Float[Tensor, " channel"]
     ) -> tuple[Population, Float[Tensor, "1 channel parameter"]]:
         """p(θ | x) of another goal, and how far it then is from ``goal``."""
-        p = case.population
+        p = at.population
         if self.config.kind == "rhythmic":
             return recentred(p, goal), torch.zeros_like(p.mean[..., 2:3])
-        path = p.path(roll_out(self.primitive, case.x.shape[1], case.timing))
+        path = p.path(roll_out(self.primitive, at.x.shape[1], at.timing))
         least = self.config.least_amplitude * (path.amax(-1) - path.amin(-1))
         return aimed(p, goal, least, scaled=self.config.goal_scaling)
 

@@ -35,9 +35,9 @@ def aimed(
     doubt = demonstrated.mean * change[..., None] / 2
     doubt[..., :3] = 0
     moved = _scaled(demonstrated, κ, aim)
-    doubtful = doubt[..., None].expand(*moved.factors.shape[:-1], 1)
-    factors = torch.cat([moved.factors, doubtful], -1)
-    return replace(moved, factors=factors), (goal - aim)[..., None]
+    doubtful = doubt[..., None].expand(*moved.loadings.shape[:-1], 1)
+    loadings = torch.cat([moved.loadings, doubtful], -1)
+    return replace(moved, loadings=loadings), (goal - aim)[..., None]
 
 
 def recentred(demonstrated: Population, goal: Float[Tensor, " channel"]) -> Population:

@@ -13,14 +13,13 @@ from torch.nn.functional import pad
 
 from zoo.movement.forcing import target_force, trajectory_matrix
 from zoo.movement.paths import PathPrior
-from zoo.movement.response import Response, Transformation, discrete_basis
+from zoo.movement.response import Response, Transformation, critical_system, discrete_basis
 
 __all__ = ["GOAL", "Imitator"]
 
 GOAL, WEIGHTS = 2, 3
 SCALES = (1.0, 10.0, 1.0, 3.0)
 RIDGE, FLOOR = 1e-4, 1e-3
-ALPHA, ALPHA_FRAME = 25.0, 0.4
 
 
 @dataclass(frozen=True)
@@ -43,18 +42,12 @@ class Imitator:
 
     def __post_init__(self) -> None:
         """Refuse constants whose Euler steps are no attractor."""
-        if not self.system.stable:
-            raise ValueError(
-                f"alpha = {self.system.alpha:g} makes Euler steps of {self.frames} frames a "
-                f"movement unstable; {ALPHA_FRAME * (self.frames - 1):.3g} is safe"
-            )
+        _ = self.system
 
     @property
     def system(self) -> Transformation:
         """The transformation system, a movement long in its unit of time; β = α/4."""
-        short = min(ALPHA, ALPHA_FRAME * (self.frames - 1))
-        α = short if self.alpha is None else self.alpha
-        return Transformation(α, α / 4, 1.0, 1 / (self.frames - 1))
+        return critical_system(self.alpha, self.frames)
 
     def design(
         self,
@@ -87,7 +80,7 @@ class Imitator:
         path: Float[Tensor, "*batch time latent"],
         seen: Bool[Tensor, "*batch time"] | None = None,
     ) -> Float[Tensor, "*batch parameter latent"]:
-        """θ of the roll-outs nearest to ``path`` where it was seen, by ridge regression."""
+        """θ of the roll-outs nearest to ``path`` where it was observed, by ridge regression."""
         if seen is None:
             return _gain(self).to(path) @ path
         design, weight = self.design().to(path.device), seen.double()[..., None]

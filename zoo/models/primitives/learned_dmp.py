@@ -11,14 +11,14 @@ from torch import Tensor, nn
 
 from zoo.contract.settings import Positive, settings
 from zoo.errors import NotFittedError
-from zoo.models.primitives.alignment import durations
-from zoo.models.primitives.cases import Cases
-from zoo.models.primitives.learning import Learned, Learning
-from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.alignment import DIRECTIONS, TEMPOS
+from zoo.models.primitives.learning import LearnedParameters, Learning
+from zoo.models.primitives.movement_law import ResidualNoise
 from zoo.models.primitives.movement_paths import RollOuts
+from zoo.models.primitives.parameter_hypotheses import DirectHypotheses
 from zoo.models.primitives.population import Population
-from zoo.movement.rollout import Primitive, Timing
-from zoo.movement.timing import TEMPOS, expected
+from zoo.models.primitives.rollout import Primitive
+from zoo.movement.timing import Expected, Timing
 from zoo.types import Layout
 
 __all__ = ["COMPONENTS", "Config", "LearnedDmp"]
@@ -98,40 +98,36 @@ class LearnedDmp(nn.Module):
         """p(θ) of a new movement."""
         return Population(self.mean, self.factors, self.private)
 
-    def _whole(self, frames: int) -> list[Timing]:
-        """Possible timings of a complete movement of ``frames`` frames."""
-        return [Timing(frames - 1.0)] if self.config.kind == "discrete" else self._timings(frames)
-
-    def _timings(self, frames: int) -> list[Timing]:
-        """Possible timings of a movement whose first ``frames`` frames are known."""
-        pairs = zip(self.units.tolist(), self.offsets.tolist(), strict=True)
-        timings = [Timing(unit, offset) for unit, offset in pairs]
-        going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
-        return going or [max(timings, key=lambda t: t.unit)]
+    @property
+    def expected(self) -> Expected:
+        """Timings that a new movement may have."""
+        return Expected.stored(self.config.kind, self.units, self.offsets)
 
     @property
     def _roll_outs(self) -> RollOuts:
-        return RollOuts(self.primitive, Noise(self.noise, self.ratio))
+        return RollOuts(self.primitive, ResidualNoise(self.noise, self.ratio))
 
-    def _given(self, timings: Sequence[Timing]) -> Cases:
-        noise, information = Noise(self.noise, self.ratio), float(self.information)
-        return Cases(self.primitive, self.population, noise, information, timings, self.scales)
+    def _given(self, timings: Sequence[Timing]) -> DirectHypotheses:
+        noise = ResidualNoise(self.noise, self.ratio)
+        return DirectHypotheses(
+            timings, self.scales, self.primitive, self.population, noise, float(self.information)
+        )
 
-    def _keep_learned(self, found: Learned) -> None:
+    def _keep_learned(self, found: LearnedParameters) -> None:
         """Keep p(θ), the noise, and the durations or the period of the movements."""
-        timings = _hypotheses(self.config.kind, found.timings)
+        expected = Expected.of(self.config.kind, found.timings, len(TEMPOS), DIRECTIONS)
         self._keep("mean", found.population.mean)
-        self._keep("factors", found.population.factors)
+        self._keep("factors", found.population.loadings)
         self._keep("private", found.population.private)
         self._keep("noise", found.noise.sqrt())
         self._keep("ratio", found.ratio)
-        alone = torch.as_tensor(found.shares.alone, dtype=self.dtype).expand(len(self.mean))
-        independent = torch.full_like(alone, found.shares.independent)
+        alone = torch.as_tensor(found.shrinkage.alone, dtype=self.dtype).expand(len(self.mean))
+        independent = torch.full_like(alone, found.shrinkage.independent)
         self._keep("shares", torch.stack([alone, independent]))
-        self._keep("information", self.mean.new_tensor(found.information))
+        self._keep("information", self.mean.new_tensor(found.shrinkage.information))
         self._keep("scales", found.scales)
-        self._keep("units", self.mean.new_tensor([t.unit for t in timings]))
-        self._keep("offsets", self.mean.new_tensor([t.offset for t in timings]))
+        self._keep("units", self.mean.new_tensor(expected.units))
+        self._keep("offsets", self.mean.new_tensor(expected.offsets))
 
     def _keep(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value.detach().to(self.dtype).clone())
@@ -139,8 +135,3 @@ class LearnedDmp(nn.Module):
     def _check_fitted(self) -> None:
         if not len(self.units):
             raise NotFittedError("dmp has not been trained: zoo.fit(model, train) comes first")
-
-
-def _hypotheses(kind: str, timings: Sequence[Timing]) -> list[Timing]:
-    """Timings that a new movement may have: durations seen, or tempos about those seen."""
-    return expected(timings, len(TEMPOS)) if kind == "rhythmic" else durations(timings, COMPONENTS)

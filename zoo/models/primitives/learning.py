@@ -10,22 +10,23 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from zoo.models.primitives.alignment import anchors_of, primitive_timings
 from zoo.models.primitives.communality import blocks, unshared
-from zoo.models.primitives.population import Population, Shares, estimate
+from zoo.models.primitives.conjugate_regression import FLOOR, conjugate_weights
+from zoo.models.primitives.population import ParameterShrinkage, Population, estimate
+from zoo.models.primitives.rollout import Primitive, kernel_values, roll_out
 from zoo.models.primitives.scales import student_scales
-from zoo.movement.conjugate_regression import FLOOR, conjugate_weights
-from zoo.movement.forcing import locally_weighted_regression, target_force
-from zoo.movement.rollout import Primitive, Timing, roll_out
-from zoo.movement.sufficient_statistics import Movements, Sums, of_weights, square_after, sums_of
-from zoo.movement.timing import anchors, timings_of
+from zoo.models.primitives.sufficient_statistics import Sums, of_weights, square_after, sums_of
+from zoo.movement.cross_validation import chosen_in_turn, folds_of, splits
+from zoo.movement.forcing import locally_weighted_regression, target_force, target_known
+from zoo.movement.timing import Movements, Timing
 
-__all__ = ["Learned", "Learning", "learn"]
+__all__ = ["LearnedParameters", "Learning", "learn_parameters"]
 
 RATIOS = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 INDEPENDENT = (0.0, 0.3, 1.0)
 SCALES = {"discrete": 16, "rhythmic": 8}
 LEAST = 3
-FEW = Shares(0.5, 0.5)
 LOW = 0.1
 INFORMATION = (1.0, 0.3, 0.1, 0.03, 0.01)
 FOLDS = 5
@@ -36,18 +37,16 @@ Learning = Literal["path", "force", "lwr"]
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedParameters:
     """p(θ) with the residual variance σ² of every channel, ρ, and the timings of the movements.
 
-    An entry counts as ``information`` of an independent one; ``scales`` are those of the t that a
-    population of few movements is.
+    ``scales`` are those of the t that a population of few movements is.
     """
 
     population: Population
     noise: Float[Tensor, " channel"]
     ratio: Float[Tensor, " channel"]
-    shares: Shares
-    information: float
+    shrinkage: ParameterShrinkage
     scales: Float[Tensor, " scale"]
     timings: tuple[Timing, ...]
 
@@ -62,22 +61,20 @@ class _Fit:
     ratio: Float[Tensor, " channel"]
 
 
-def learn(
+def learn_parameters(
     primitive: Primitive,
     learning: Learning,
     period: float | None,
     values: Float[Tensor, "sequence time channel"],
     mask: Bool[Tensor, "sequence time channel"],
     lengths: Int[Tensor, " sequence"],
-) -> Learned:
+) -> LearnedParameters:
     """Weights of every movement, noise by their evidence, and the population over movements."""
     movements = [
         (x[:n], seen[:n]) for x, seen, n in zip(values, mask, lengths.tolist(), strict=True)
     ]
-    timings = timings_of(primitive, movements, period)
-    starts = torch.stack(
-        [anchors(primitive, x, seen, t) for (x, seen), t in zip(movements, timings, strict=True)]
-    )
+    timings = primitive_timings(primitive, movements, period)
+    starts = anchors_of(primitive, movements, timings)
     floor = _floor(movements, timings, primitive.kernels)
     scales = torch.ones(1, dtype=torch.float64)
     if len(movements) > 1:
@@ -92,14 +89,14 @@ def learn(
         parameters, uncertainty = _weights(every.at(own), starts)
     fit, winner = _residuals(every, ratios, parameters, uncertainty)
     whole, early = every.of_channels(winner), begun.of_channels(winner)
-    shares, information = FEW, 1.0
+    shrinkage = ParameterShrinkage()
     if len(movements) >= LEAST:
         entries = _entries(primitive, movements, timings)
-        shares, information = _chosen(_LeftOut(fit, whole, early, entries, floor))
-    population = estimate(fit.parameters, fit.uncertainty, shares, floor)
+        shrinkage = _chosen(_HeldOut(fit, whole, early, entries, floor))
+    population = estimate(fit.parameters, fit.uncertainty, shrinkage, floor)
     if not all(bool(seen.all()) for _, seen in movements):
-        population = _refined(population, whole, fit.noise, shares, floor)
-    return Learned(population, fit.noise, fit.ratio, shares, information, scales, tuple(timings))
+        population = _refined(population, whole, fit.noise, shrinkage, floor)
+    return LearnedParameters(population, fit.noise, fit.ratio, shrinkage, scales, tuple(timings))
 
 
 def _ratios(learning: Learning) -> Float[Tensor, " ratio"]:
@@ -112,9 +109,9 @@ def _weights(sums: Sums, starts: Tensor) -> tuple[Tensor, Tensor]:
     """θ of every movement and its mean posterior covariance."""
     precision, linear = of_weights(sums, starts)
     count, square = (sums.count - 3).clamp_min(0), square_after(sums, starts)
-    found = conjugate_weights(precision, linear, square, count, sums.log_volume)
-    spread = found.noise[:, None, None] * found.covariance.mean(0)
-    uncertainty = torch.nn.functional.pad(spread, (3, 0, 3, 0))
+    found = conjugate_weights(precision, linear, square, count)
+    covariance = found.noise[:, None, None] * found.covariance.mean(0)
+    uncertainty = torch.nn.functional.pad(covariance, (3, 0, 3, 0))
     return torch.cat([starts, found.mean], dim=2), uncertainty
 
 
@@ -139,11 +136,11 @@ def _local_weights(
     primitive: Primitive, movements: Movements, timings: list[Timing], starts: Tensor
 ) -> tuple[Tensor, Tensor]:
     """θ of every movement by (61), which has no posterior covariance."""
-    rows = []
+    rows, kind, count = [], primitive.kind, primitive.kernels
     for (x, seen), timing, start in zip(movements, timings, starts, strict=True):
         _, target = target_force(x, start[:, 2], primitive.system(timing))
-        usable = seen[:-1] & seen[1:] & torch.cat([seen[:1], seen[:-2]])
-        kernels = primitive.kernel_values(len(x), timing, normalised=False)[:-1]
+        usable = target_known(seen.mT).mT
+        kernels = kernel_values(kind, count, len(x), timing, normalised=False)[:-1]
         gate = primitive.gate(len(x), timing)[:-1]
         rows.append(locally_weighted_regression(kernels, target, scale=gate, mask=usable).T)
     parameters = torch.cat([starts, torch.stack(rows)], dim=2)
@@ -152,7 +149,7 @@ def _local_weights(
 
 
 def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
-    """Least variance of the parameters; of one movement alone the spread over its own time."""
+    """Least variance of the parameters; of one movement alone the variance over its own time."""
     floor = torch.full((3 + kernels,), 1e-8, dtype=torch.float64)
     if len(movements) == 1:
         ((x, seen),) = movements
@@ -164,17 +161,16 @@ def _floor(movements: Movements, timings: list[Timing], kernels: int) -> Tensor:
     return floor
 
 
-def _chosen(left_out: _LeftOut) -> tuple[Shares, float]:
-    """Shares, and then information, under which entries of movements left out are most probable.
+def _chosen(held_out: _HeldOut) -> ParameterShrinkage:
+    """Shares, and then information, under which entries of held-out movements are most probable.
 
     What a channel has alone is what the others cannot tell of it. Shares are compared at a low
     information: at 1 they would make up for residuals that go together over channels and time,
     which are no matter of movements' parameters.
     """
-    alone = unshared(left_out.fit.parameters)
-    every = [Shares(alone, part) for part in INDEPENDENT]
-    shares = max(every, key=lambda s: left_out.density(s, LOW))
-    return shares, max(INFORMATION, key=lambda c: left_out.density(shares, c))
+    start = ParameterShrinkage(unshared(held_out.fit.parameters), INDEPENDENT[0], LOW)
+    grids = [("independent", INDEPENDENT), ("information", INFORMATION)]
+    return chosen_in_turn(start, grids, held_out.density)
 
 
 @dataclass(frozen=True)
@@ -210,7 +206,7 @@ def _entries(primitive: Primitive, movements: Movements, timings: list[Timing]) 
 
 
 @dataclass(frozen=True)
-class _LeftOut:
+class _HeldOut:
     """Movements in folds, each under the population of the others."""
 
     fit: _Fit
@@ -219,18 +215,18 @@ class _LeftOut:
     entries: _Entries
     floor: Tensor
 
-    def density(self, shares: Shares, information: float) -> float:
-        """Mean log density of single entries left out, to two questions that count alike.
+    def density(self, shrinkage: ParameterShrinkage) -> float:
+        """Mean log density of single held-out entries, to two questions that count alike.
 
         The later three quarters are given the first; a block of channels, another in every fold, is
         given the others. Of single entries: jointly, thousands would count as independent.
         """
-        e, found = self.entries, []
+        e, information, found = self.entries, shrinkage.information, []
         count = e.seen.sum((0, 1)).clamp_min(1)
         rest = (e.errors(self.fit.parameters).square() * e.seen).sum((0, 1)) / count
         rest = rest.clamp_min(FLOOR)
         block = blocks(len(rest))
-        for fold, rows, population in self._folds(shares):
+        for fold, rows, population in self._folds(shrinkage):
             a, b, whole_a, whole_b = self._likelihoods(rows)
             hidden = block == fold % (block.max() + 1)
             known = information * (~hidden).to(b)
@@ -241,13 +237,12 @@ class _LeftOut:
             found.append(_of_entries(filled, here, hidden[None, None], rest))
         return float(torch.stack(found).unflatten(0, (-1, 2)).nanmean(0).nansum())
 
-    def _folds(self, shares: Shares) -> Iterator[tuple[int, Tensor, Population]]:
+    def _folds(self, shrinkage: ParameterShrinkage) -> Iterator[tuple[int, Tensor, Population]]:
         """Every fold, its movements, and the population of the others."""
         parameters = self.fit.parameters
-        folds = torch.arange(len(parameters)) % min(FOLDS, len(parameters))
-        for fold in range(int(folds.max()) + 1):
-            others = parameters[folds != fold]
-            yield fold, folds == fold, estimate(others, self.fit.uncertainty, shares, self.floor)
+        for fold, rows in splits(folds_of(torch.arange(len(parameters)), FOLDS)):
+            others = parameters[~rows]
+            yield fold, rows, estimate(others, self.fit.uncertainty, shrinkage, self.floor)
 
     def _likelihoods(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Of the first quarter, and of all."""
@@ -262,12 +257,12 @@ def _of_entries(
     asked: Bool[Tensor, "#sequence #place #channel"],
     rest: Float[Tensor, " channel"],
 ) -> Tensor:
-    """Mean log density of the entries asked, up to a constant; NaN where none was seen."""
-    root = torch.cat([population.factors, population.private], dim=-1)
+    """Mean log density of the entries asked, up to a constant; NaN where none was observed."""
+    root = torch.cat([population.loadings, population.private], dim=-1)
     alike = bool((entries.design == entries.design[0]).all())
     design = entries.design[:1] if alike else entries.design
-    spread = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
-    variance = spread + rest
+    path = torch.linalg.vector_norm(design[:, None] @ root, dim=-1).square().mT
+    variance = path + rest
     density = -(entries.errors(population.mean).square() / variance + variance.log()) / 2
     mean: Tensor = density[entries.seen & asked].mean()
     return mean
@@ -278,9 +273,9 @@ def _likelihood(sums: Sums, noise: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _refined(
-    population: Population, whole: Sums, noise: Tensor, shares: Shares, floor: Tensor
+    population: Population, whole: Sums, noise: Tensor, shrinkage: ParameterShrinkage, floor: Tensor
 ) -> Population:
     """The population again, from parameters that it completed itself where frames were missing."""
     part = population.condition(*_likelihood(whole, noise))
-    spread = part.private @ part.private.mT + part.factors @ part.factors.mT
-    return estimate(part.mean, spread.mean(0), shares, floor)
+    covariance = part.private @ part.private.mT + part.loadings @ part.loadings.mT
+    return estimate(part.mean, covariance.mean(0), shrinkage, floor)

@@ -11,16 +11,17 @@ from jaxtyping import Bool, Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from zoo.models.primitives.kalman import PathNoise
+from zoo.models.primitives.rollout import Primitive, roll_out
+from zoo.models.primitives.sufficient_statistics import sights
 from zoo.movement.components import alike
-from zoo.movement.kalman import PathNoise
-from zoo.movement.rollout import Primitive, Timing, roll_out
-from zoo.movement.sufficient_statistics import sights
+from zoo.movement.timing import Timing
 
-__all__ = ["MovementLaw", "Noise"]
+__all__ = ["MovementLaw", "ResidualNoise"]
 
 
 @dataclass(frozen=True)
-class Noise:
+class ResidualNoise:
     """σ and ρ of every channel."""
 
     std: Float[Tensor, " channel"]
@@ -39,7 +40,7 @@ class MovementLaw(TorchDistribution):
         self,
         primitive: Primitive,
         timings: Sequence[Timing],
-        noise: Noise,
+        noise: ResidualNoise,
         timing: Int[Tensor, "*batch"],
         θ: Float[Tensor, "*batch channel parameter"],
         seen: Bool[Tensor, "sequence time channel"],

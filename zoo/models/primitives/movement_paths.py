@@ -10,14 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from zoo.models.primitives.cases import Case
-from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.kalman import PathNoise
+from zoo.models.primitives.movement_law import ResidualNoise
+from zoo.models.primitives.parameter_hypotheses import AtTiming
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.rollout import Primitive, roll_out
 from zoo.movement.components import Draw, Paths
 from zoo.movement.forcing import trajectory_matrix
-from zoo.movement.kalman import PathNoise
 from zoo.movement.response import Response
-from zoo.movement.rollout import Primitive, Timing, roll_out
+from zoo.movement.timing import Timing
 
 __all__ = ["RollOuts", "Term"]
 
@@ -29,33 +30,33 @@ class RollOuts:
     """Paths y = Σ R θ + σ N ε of a primitive, θ Gaussian in every term."""
 
     primitive: Primitive
-    noise: Noise
+    noise: ResidualNoise
 
-    def anew(self, case: Case, frames: int) -> Paths:
+    def anew(self, at: AtTiming, frames: int) -> Paths:
         """p(θ | x) rolled out over ``frames`` frames, with new forces."""
-        design = roll_out(self.primitive, frames, case.timing)
-        return self.summed([(design, case.population)], case.timing)
+        design = roll_out(self.primitive, frames, at.timing)
+        return self.summed([(design, at.population)], at.timing)
 
     def summed(self, terms: Sequence[Term], timing: Timing) -> Paths:
         """Sum of design θ over ``terms``, with new forces."""
         mean, variance, draw = _sum(terms)
         noise, σ = self._noise(len(terms[0][0]), timing), self.noise.std
-        spread = noise.variance[:, None] * σ.square()
-        return Paths(mean, variance + spread, lambda n: draw(n) + σ * noise.draw(n, mean))
+        forces = noise.variance[:, None] * σ.square()
+        return Paths(mean, variance + forces, lambda n: draw(n) + σ * noise.draw(n, mean))
 
-    def followed(self, case: Case) -> Paths:
+    def followed(self, at: AtTiming) -> Paths:
         """The paths given the entries observed; draws by Matheron."""
-        view, σ, root = case.sight, self.noise.std, self.noise.ratio.sqrt()
-        noise, seen = self._noise(case.x.shape[1], case.timing), view.smoother.seen.mT
+        view, σ, root = at.sight, self.noise.std, self.noise.ratio.sqrt()
+        noise, seen = self._noise(at.x.shape[1], at.timing), view.smoother.seen.mT
 
         def residual(count: int) -> Tensor:
-            force = noise.draw(count, case.x)
+            force = noise.draw(count, at.x)
             pseudo = (force + root * torch.randn_like(force)) * seen
-            return view.follow(case.x) + σ * (force - view.follow(pseudo))
+            return view.follow(at.x) + σ * (force - view.follow(pseudo))
 
-        mean, variance, draw = _sum([(view.given, case.population)])
-        spread = view.smoother.variance.mT * σ.square()
-        return Paths(mean + view.follow(case.x), variance + spread, lambda n: draw(n) + residual(n))
+        mean, variance, draw = _sum([(view.given, at.population)])
+        left = view.smoother.variance.mT * σ.square()
+        return Paths(mean + view.follow(at.x), variance + left, lambda n: draw(n) + residual(n))
 
     def part(
         self, timing: Timing, share: Float[Tensor, " step"], *, begin: bool

@@ -20,13 +20,13 @@ from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
 from zoo.models.frames import pca
 from zoo.models.primitives import dmp
-from zoo.models.primitives.cases import Posteriors
 from zoo.models.primitives.learned_dmp import COMPONENTS
-from zoo.models.primitives.projected import Projected, ProjectedLaw
+from zoo.models.primitives.parameter_hypotheses import ParameterPosterior
+from zoo.models.primitives.projected import ProjectedHypotheses, ProjectedLaw
 from zoo.models.primitives.projection import Projection
 from zoo.movement.components import Components, Paths
 from zoo.movement.demonstrations import extremes, seen_entries, seen_movements
-from zoo.movement.rollout import Timing
+from zoo.movement.timing import Timing, duration
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior, Sites, Wishes
 
@@ -131,7 +131,7 @@ class PcaDmp(nn.Module):
         """p(timing, scale, θ | x), exactly."""
         x, seen = batch.movements, seen_movements(batch)
         unknown = self._unknowns(seen, _whole(seen))
-        given = Posteriors(unknown, x, seen)
+        given = ParameterPosterior(unknown, x, seen)
 
         def private(drawn: Mapping[str, Tensor]) -> dist.TorchDistribution:
             law = given.private(drawn)
@@ -166,7 +166,7 @@ class PcaDmp(nn.Module):
         return self.pca.decode(z)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
-        """The paths given the entries seen."""
+        """The paths given the entries observed."""
         seen = seen_entries(batch)
         return self._filled(batch.values, seen, _whole(seen), 0, draws)
 
@@ -177,7 +177,7 @@ class PcaDmp(nn.Module):
         pad, known = (0, 0, 0, horizon), batch.values.shape[1]
         seen = functional.pad(seen_entries(batch), pad)
         values = functional.pad(batch.values, pad)
-        return self._filled(values, seen, self._timings(known), known, draws)
+        return self._filled(values, seen, self.dmp.expected.lasting(known), known, draws)
 
     def generate(
         self,
@@ -211,39 +211,29 @@ class PcaDmp(nn.Module):
         white = (force * self.dmp.ratio - self._least).clamp_min(0)
         return Projection(f.loading, f.mean, f.noise, force, white)
 
-    def _unknowns(self, seen: Tensor, timings: list[Timing]) -> Projected:
+    def _unknowns(self, seen: Tensor, timings: list[Timing]) -> ProjectedHypotheses:
         d, information = self.dmp, float(self.dmp.information)
-        return Projected.of(
+        return ProjectedHypotheses.of(
             self._projection, d.primitive, d.population, information, timings, d.scales, seen
         )
-
-    def _timings(self, known: int) -> list[Timing]:
-        """Durations of training movements that last as long."""
-        timings = [Timing(unit) for unit in self.dmp.units.tolist()]
-        going = [t for t in timings if t.unit >= known]
-        return going or [max(timings, key=lambda t: t.unit)]
 
     def _filled(
         self, values: Tensor, seen: Tensor, timings: list[Timing], begin: int, draws: int
     ) -> Predictive:
         """The posterior predictive from frame ``begin`` on."""
-        alone = len(timings) * len(self.dmp.scales) == 1
-        parts = self._shown(values, seen, timings, 1 if alone else COMPONENTS, fresh=False)
+        parts = self._shown(values, seen, timings, COMPONENTS, fresh=False)
         return _predictive(parts.after(begin), self.pca.noise, draws)
 
     def _shown(
         self, values: Tensor, seen: Tensor, timings: list[Timing], count: int, *, fresh: bool
     ) -> Components:
         """W z + μ as a mixture over timings and scales."""
-        parts, unknown = Components.empty(count, values), self._unknowns(seen, timings)
+        unknown = self._unknowns(seen, timings)
+        count = unknown.at_most(count)
+        parts = Components.empty(count, values)
         for rows, which, z in unknown.latent(values, seen, count, fresh=fresh):
             parts.put(rows, which, unknown.projection.paths(z))
         return parts
-
-    @property
-    def _white(self) -> Float[Tensor, " latent"]:
-        """Standard deviation of the primitives' white noise."""
-        return self.dmp.noise * self.dmp.ratio.sqrt()
 
     def _components(
         self, values: Float[Tensor, "sequence time channel"], mask: Tensor | None
@@ -268,11 +258,11 @@ class PcaDmp(nn.Module):
         """W z + μ of components counted as independent."""
         view = self._projection
         square = view.loading.square().T
-        spread = None if latent.epistemic is None else latent.epistemic.square() @ square
+        variance = None if latent.epistemic is None else latent.epistemic.square() @ square
         return Predictive(
             location=view.shown(latent.location),
             noise=(view.white @ square + view.noise.square()).sqrt(),
-            epistemic=None if spread is None else spread.sqrt(),
+            epistemic=None if variance is None else variance.sqrt(),
             draws=latent.redrawn(view.shown),
         )
 
@@ -287,4 +277,4 @@ def _predictive(parts: Components, noise: Tensor | None, draws: int) -> Predicti
 
 
 def _whole(seen: Bool[Tensor, "sequence frame channel"]) -> list[Timing]:
-    return [Timing(seen.shape[1] - 1.0)]
+    return [duration(seen.shape[1])]

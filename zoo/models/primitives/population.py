@@ -4,7 +4,7 @@ A movement i has one parameter vector θ_ic for every channel c::
 
     a_i ~ N(0, I_r),   δ_ic ~ N(0, V_c V_cᵀ),   θ_ic = μ_c + L_c a_i + δ_ic
 
-The factors a carry what channels have in common, δ what each has alone. Seen data enter as a
+The factors a carry what channels have in common, δ what each has alone. Observed data enter as a
 Gaussian likelihood with precision A_c and linear term b_c of every channel; the posterior is of
 the same form, exactly.
 """
@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Population", "Shares", "estimate"]
+__all__ = ["ParameterShrinkage", "Population", "estimate"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Population:
     """μ, L and V; ``mean`` may have a leading ``sequence`` axis, and so may the others."""
 
     mean: Float[Tensor, "*#sequence channel parameter"]
-    factors: Float[Tensor, "*#sequence channel parameter factor"]
+    loadings: Float[Tensor, "*#sequence channel parameter factor"]
     private: Float[Tensor, "*#sequence channel parameter parameter"]
 
     @classmethod
@@ -43,11 +43,11 @@ class Population:
     ) -> Population:
         """Posterior given likelihoods exp(−½ θᵀAθ + bᵀθ) of every channel."""
         solved = _solve(self, precision, linear)
-        shared = _times(solved.keep @ self.factors, solved.shared_mean[..., None, :])
+        shared = _times(solved.keep @ self.loadings, solved.shared_mean[..., None, :])
         mean = self.mean + _times(solved.gain, solved.error) + shared
         root = torch.linalg.solve_triangular(solved.shared_root, solved.eye, upper=False).mT
-        factors = solved.keep @ self.factors @ root.unsqueeze(-3)
-        return Population(mean, factors, solved.private)
+        loadings = solved.keep @ self.loadings @ root.unsqueeze(-3)
+        return Population(mean, loadings, solved.private)
 
     def log_evidence(
         self,
@@ -70,7 +70,7 @@ class Population:
         """Those of the populations with s times the deviations, for every s."""
         if len(precision) > 1 or len(scales) == 1:
             s = scales[:, None, None, None, None]
-            each = Population(self.mean, s * self.factors, s * self.private)
+            each = Population(self.mean, s * self.loadings, s * self.private)
             return each.log_evidence(precision, linear)
         return _evidence_of_scales(self, scales, precision[0], linear)
 
@@ -91,7 +91,7 @@ class Population:
     ) -> tuple[Tensor, Tensor]:
         """Mean of p(V⁻¹δ | a, x) and a root Q of its precision, Q Qᵀ."""
         v, eye = self.private, torch.eye(self.private.shape[-1], dtype=linear.dtype)
-        θ = self.mean + _times(self.factors, shared[..., None, :])
+        θ = self.mean + _times(self.loadings, shared[..., None, :])
         root = torch.linalg.cholesky(eye + v.mT @ precision @ v)
         pull = _times(v.mT, linear - _times(precision, θ))
         return torch.cholesky_solve(pull[..., None], root)[..., 0], root
@@ -101,17 +101,17 @@ class Population:
     ) -> Population:
         """The population of scale ⊙ θ + shift."""
         wide = scale[..., None]
-        return Population(self.mean * scale + shift, self.factors * wide, self.private * wide)
+        return Population(self.mean * scale + shift, self.loadings * wide, self.private * wide)
 
     def moments(
         self, design: Float[Tensor, "*channel time parameter"]
     ) -> tuple[Float[Tensor, "sequence time channel"], Float[Tensor, "*#sequence time channel"]]:
         """Mean and variance of design θ_c at every time."""
-        root = torch.cat([self.factors, self.private], dim=-1)
-        if self.factors.shape[-1]:
+        root = torch.cat([self.loadings, self.private], dim=-1)
+        if self.loadings.shape[-1]:
             root = torch.linalg.qr(root.mT, mode="r")[1].mT
-        spread = torch.linalg.vector_norm(design @ root, dim=-1).square()
-        return self.path(design).mT, spread.mT
+        variance = torch.linalg.vector_norm(design @ root, dim=-1).square()
+        return self.path(design).mT, variance.mT
 
     def path(
         self, design: Float[Tensor, "*channel time parameter"]
@@ -123,31 +123,32 @@ class Population:
 
     def sample(self, count: int) -> Float[Tensor, "sample sequence channel parameter"]:
         """Joint draws of θ, from torch's default generator."""
-        *_, parameters, rank = self.factors.shape
+        *_, parameters, rank = self.loadings.shape
         rows, channels = self.mean.shape[:-2], self.mean.shape[-2]
         a = torch.randn(count, *rows, 1, rank, dtype=self.mean.dtype, device=self.mean.device)
         white = torch.randn(
             count, *rows, channels, parameters, dtype=self.mean.dtype, device=self.mean.device
         )
-        return self.mean + _times(self.factors, a) + _times(self.private, white)
+        return self.mean + _times(self.loadings, a) + _times(self.private, white)
 
 
 @dataclass(frozen=True)
-class Shares:
+class ParameterShrinkage:
     """What of its covariance over movements each channel has alone, and of that every parameter.
 
     The sample covariance of n movements has rank n − 1: under it alone a few frames would settle
-    the rest of the movement.
+    the rest of the movement. An entry counts as ``information`` of an independent one.
     """
 
-    alone: Float[Tensor, " channel"] | float
-    independent: float
+    alone: Float[Tensor, " channel"] | float = 0.5
+    independent: float = 0.5
+    information: float = 1.0
 
 
 def estimate(
     parameters: Float[Tensor, "sequence channel parameter"],
     uncertainty: Float[Tensor, "channel parameter parameter"],
-    shares: Shares,
+    shrinkage: ParameterShrinkage,
     floor: Float[Tensor, " parameter"],
 ) -> Population:
     """Population of several movements, its covariance shrunk towards independent parameters.
@@ -167,11 +168,11 @@ def estimate(
     size = deviation.square().sum((0, 2)).clamp_min(torch.finfo(mean.dtype).tiny)
     scaled = deviation / size.sqrt()[:, None]
     shape = torch.einsum("scp,scq->pq", scaled, scaled) / channels
-    shape = torch.lerp(shape, torch.diag(shape.diagonal()), shares.independent)
-    alone = torch.as_tensor(shares.alone, dtype=mean.dtype).view(-1, 1, 1)
+    shape = torch.lerp(shape, torch.diag(shape.diagonal()), shrinkage.independent)
+    alone = torch.as_tensor(shrinkage.alone, dtype=mean.dtype).view(-1, 1, 1)
     private = private + alone * size[:, None, None] * shape
-    factors = (1 - alone).sqrt() * deviation.permute(1, 2, 0)
-    return Population(mean, factors, _root(private))
+    loadings = (1 - alone).sqrt() * deviation.permute(1, 2, 0)
+    return Population(mean, loadings, _root(private))
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ class _Solved:
 
 
 def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
-    v, factors = prior.private, prior.factors
+    v, loadings = prior.private, prior.loadings
     if precision.ndim == 4 and len(precision) == 1:
         precision = precision[0]
     eye = torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
@@ -199,10 +200,10 @@ def _solve(prior: Population, precision: Tensor, linear: Tensor) -> _Solved:
     gain = private @ private.mT
     keep = eye - gain @ precision
     error = linear - _times(precision, prior.mean)
-    shared_eye = torch.eye(factors.shape[-1], dtype=v.dtype, device=v.device)
-    kept = keep @ factors
+    shared_eye = torch.eye(loadings.shape[-1], dtype=v.dtype, device=v.device)
+    kept = keep @ loadings
     informed = (precision @ kept).flatten(-3, -2)
-    shared = shared_eye + factors.flatten(-3, -2).mT @ informed
+    shared = shared_eye + loadings.flatten(-3, -2).mT @ informed
     shared_root = torch.linalg.cholesky((shared + shared.mT) / 2)
     shared_linear = _across(kept.flatten(-3, -2).mT, error.flatten(-2))
     log_volume = root.diagonal(dim1=-2, dim2=-1).log().sum((-1, -2))
@@ -223,19 +224,19 @@ def _evidence_of_scales(
     prior: Population, scales: Tensor, precision: Tensor, linear: Tensor
 ) -> Float[Tensor, "scale sequence"]:
     """Log evidences with VᵀAV = U D Uᵀ, so that s acts on D alone."""
-    v, rank = prior.private, prior.factors.shape[-1]
+    v, rank = prior.private, prior.loadings.shape[-1]
     eye = torch.eye(rank, dtype=v.dtype, device=v.device)
     values, turned = torch.linalg.eigh(v.mT @ precision @ v)
     d, basis = values.clamp_min(0).flatten(), v @ turned
-    factors = torch.linalg.solve(basis, prior.factors).flatten(0, 1)
+    loadings = torch.linalg.solve(basis, prior.loadings).flatten(0, 1)
     error = linear - _times(precision, prior.mean)
     white = _times(basis.mT, error).flatten(-2)
     found = []
     for s in scales:
         wide = 1 + s.square() * d
-        shared = eye + factors.mT @ (factors * (s.square() * d / wide)[:, None])
+        shared = eye + loadings.mT @ (loadings * (s.square() * d / wide)[:, None])
         root = torch.linalg.cholesky(shared)
-        told = factors.mT @ (s * white / wide).mT
+        told = loadings.mT @ (s * white / wide).mT
         pull = torch.linalg.solve_triangular(root, told, upper=False)
         private = (s * white).square() @ (1 / wide)
         volume = wide.log().sum() / 2 + root.diagonal().log().sum()

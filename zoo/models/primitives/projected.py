@@ -11,15 +11,16 @@ from jaxtyping import Bool, Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from zoo.models.primitives.cases import Group, Unknowns
-from zoo.models.primitives.movement_law import Noise
+from zoo.models.primitives.kalman import PathNoise
+from zoo.models.primitives.movement_law import ResidualNoise
+from zoo.models.primitives.parameter_hypotheses import ParameterHypotheses, Summed
 from zoo.models.primitives.population import Population
-from zoo.models.primitives.projection import Conditional, Latent, Projection, joined
+from zoo.models.primitives.projection import ComponentPaths, GivenEntries, Projection, joined
+from zoo.models.primitives.rollout import Primitive, roll_out
 from zoo.movement.components import alike
-from zoo.movement.kalman import PathNoise
-from zoo.movement.rollout import Primitive, Timing, roll_out
+from zoo.movement.timing import Timing
 
-__all__ = ["Projected", "ProjectedLaw"]
+__all__ = ["ProjectedHypotheses", "ProjectedLaw"]
 
 
 class ProjectedLaw(TorchDistribution):
@@ -74,7 +75,7 @@ class ProjectedLaw(TorchDistribution):
 
 
 @dataclass(frozen=True)
-class Projected(Unknowns):
+class ProjectedHypotheses(ParameterHypotheses[Summed]):
     """Timings and scales of movements seen through W, by so many blocks of components."""
 
     projection: Projection
@@ -90,41 +91,41 @@ class Projected(Unknowns):
         timings: Sequence[Timing],
         scales: Float[Tensor, " scale"],
         seen: Bool[Tensor, "sequence time channel"],
-    ) -> Projected:
+    ) -> ProjectedHypotheses:
         """Blocks that the entries ``seen`` of all movements fall into."""
         blocks, one = projection.blocks(seen), torch.ones_like(projection.force)
-        noise = Noise(one[:blocks], one[:blocks])
+        noise = ResidualNoise(one[:blocks], one[:blocks])
         parts = population if blocks > 1 else joined(population)
-        return cls(primitive, parts, noise, information, timings, scales, projection, blocks)
+        return cls(timings, scales, primitive, parts, noise, information, projection, blocks)
 
-    def groups(
+    def observed_alike(
         self,
         values: Float[Tensor, "sequence time channel"],
         seen: Bool[Tensor, "sequence time channel"],
-    ) -> Iterator[Group]:
+    ) -> Iterator[Summed]:
         """What the movements say of θ."""
-        for group, _ in self._viewed(values, seen):
-            yield group
+        for part, _ in self._viewed(values, seen):
+            yield part
 
     def latent(
         self, values: Tensor, seen: Tensor, count: int, *, fresh: bool = False
-    ) -> Iterator[tuple[Int[Tensor, " some"], Tensor, Latent]]:
+    ) -> Iterator[tuple[Int[Tensor, " some"], Tensor, ComponentPaths]]:
         """Rows, which of ``count`` components they are, and z given x; ``fresh`` only has θ so."""
-        for group, views in self._viewed(values, seen):
-            for timing, scale, some, which in self.picked(group, count):
-                posterior = self.posterior(group, timing, scale, some)
-                view, x = views[timing], group.x[some]
+        for part, views in self._viewed(values, seen):
+            for timing, scale, some, which in self.picked(part, count):
+                posterior = self.posterior(part, timing, scale, some)
+                view, x = views[timing], part.x[some]
                 if fresh:
                     view, x = self._view(self.timings[timing], view.seen & False), x * 0
-                yield group.rows[some], which, view.paths(x, posterior)
+                yield part.rows[some], which, view.paths(x, posterior)
 
-    def _viewed(self, values: Tensor, seen: Tensor) -> Iterator[tuple[Group, list[Conditional]]]:
+    def _viewed(self, values: Tensor, seen: Tensor) -> Iterator[tuple[Summed, list[GivenEntries]]]:
         for rows, mask in alike(seen):
             x = (values[rows] - self.projection.mean) * mask
             views = [self._view(timing, mask) for timing in self.timings]
-            yield Group(rows, x, [view.sums(x) for view in views]), views
+            yield Summed(rows, x, [view.sums(x) for view in views]), views
 
-    def _view(self, timing: Timing, seen: Tensor) -> Conditional:
+    def _view(self, timing: Timing, seen: Tensor) -> GivenEntries:
         return _view(self.projection, self.primitive, timing, seen, self.blocks)
 
 
@@ -134,7 +135,7 @@ def _view(
     timing: Timing,
     seen: Tensor,
     blocks: int | None = None,
-) -> Conditional:
+) -> GivenEntries:
     noise = PathNoise(primitive.system(timing), len(seen))
     design = roll_out(primitive, len(seen), timing)
-    return Conditional(projection, noise, design, seen, blocks or projection.blocks(seen))
+    return GivenEntries(projection, noise, design, seen, blocks or projection.blocks(seen))

@@ -24,16 +24,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from zoo.models.primitives.kalman import PathNoise
 from zoo.models.primitives.population import Population
+from zoo.models.primitives.sufficient_statistics import Sums
 from zoo.movement.components import Draw, Paths
-from zoo.movement.kalman import PathNoise
-from zoo.movement.sufficient_statistics import Sums
 
-__all__ = ["Conditional", "Latent", "Projection", "joined"]
+__all__ = ["ComponentPaths", "GivenEntries", "Projection", "joined"]
 
 
 @dataclass(frozen=True)
-class Latent:
+class ComponentPaths:
     """Moments of components at every time; ``draw`` gives so many joint draws of their paths."""
 
     mean: Float[Tensor, "sequence time latent"]
@@ -64,7 +64,7 @@ class Projection:
         x: Tensor = z @ self.loading.T + self.mean
         return x
 
-    def paths(self, z: Latent) -> Paths:
+    def paths(self, z: ComponentPaths) -> Paths:
         """Moments and draws of W z + μ."""
         w, mean = self.loading, self.shown(z.mean)
         variance = torch.einsum("dk,stkj,dj->std", w, z.covariance, w).clamp_min(0)
@@ -79,7 +79,7 @@ class Projection:
 
 
 @dataclass(frozen=True)
-class Conditional:
+class GivenEntries:
     """z of movements given the entries ``seen``, at one timing, by blocks of components."""
 
     projection: Projection
@@ -102,7 +102,7 @@ class Conditional:
         precision = (self._white.mT @ self._white)[None]
         return Sums(precision, linear, square, count, volume.expand_as(square))
 
-    def paths(self, x: Float[Tensor, "sequence time channel"], p: Population) -> Latent:
+    def paths(self, x: Float[Tensor, "sequence time channel"], p: Population) -> ComponentPaths:
         """Moments and draws of z given x − μ, with θ of the distribution ``p`` given x."""
         follow = self._gain @ self._observed(x)
         mean = self._unfolded(self._moved(p.mean) + follow.movedim(-1, 0))
@@ -116,7 +116,7 @@ class Conditional:
             moved = self._unfolded(self._moved(p.sample(count)))
             return fresh + moved + pull.reshape(fresh.shape)
 
-        return Latent(mean, self._covariance(p), draw)
+        return ComponentPaths(mean, self._covariance(p), draw)
 
     def _moved(
         self, θ: Float[Tensor, "*batch block parameter"]
@@ -125,7 +125,7 @@ class Conditional:
 
     def _covariance(self, p: Population) -> Float[Tensor, "#sequence time latent latent"]:
         """Of all components at every time."""
-        together = self._unfolded((self._given @ p.factors).movedim(-1, 0))
+        together = self._unfolded((self._given @ p.loadings).movedim(-1, 0))
         shared = torch.einsum("f...tk,f...tj->...tkj", together, together)
         alone = (self._given @ p.private).unflatten(-2, (-1, self.noise.frames))
         within = torch.einsum("...bktq,...bjtq->...btkj", alone, alone)
@@ -223,4 +223,4 @@ class Conditional:
 def joined(p: Population) -> Population:
     """The same distribution, with all channels as one."""
     private = torch.block_diag(*p.private)
-    return Population(p.mean.flatten()[None], p.factors.flatten(0, 1)[None], private[None])
+    return Population(p.mean.flatten()[None], p.loadings.flatten(0, 1)[None], private[None])

@@ -17,11 +17,11 @@ from torch.nn import functional
 from zoo.contract.readiness import check_fitted
 from zoo.contract.settings import Count, Positive, settings
 from zoo.datasets.records import Pairs, Sequences
-from zoo.models.primitives.cross_fitting import Choice, Prepared, choose, inflation
-from zoo.models.primitives.hypotheses import Hypotheses, Posteriors
+from zoo.models.primitives.cross_fitting import Prepared, WeightShrinkage, choose, inflation
 from zoo.models.primitives.preparation import Preparation
 from zoo.models.primitives.scales import student_scales
-from zoo.models.primitives.weight_learning import Noise, learn
+from zoo.models.primitives.weight_hypotheses import WeightHypotheses, WeightPosterior
+from zoo.models.primitives.weight_learning import EntryNoise, learn_weights
 from zoo.models.primitives.weights import Basis, Weights, superposed
 from zoo.movement.components import Components, Paths, ramp
 from zoo.movement.demonstrations import (
@@ -31,7 +31,7 @@ from zoo.movement.demonstrations import (
     seen_entries,
     seen_movements,
 )
-from zoo.movement.rollout import Timing
+from zoo.movement.timing import Expected, Timing
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior, Sites, Wishes
 
@@ -51,7 +51,7 @@ class Config:
     movements is in s; None finds it by autocorrelation.
     ``shrinkage`` is the share of the inverse-Wishart prior in Σ; ``information`` is the part of an
     independent observation that every entry counts, 1 for Bayes' rule. None chooses them by the
-    density of movements left out. EM ends after ``em_iterations`` or a gain of ``em_tolerance``
+    density of held-out movements. EM ends after ``em_iterations`` or a gain of ``em_tolerance``
     nats an entry.
     """
 
@@ -87,7 +87,7 @@ class ProMP(nn.Module):
     entry as ``information`` of an independent one, since residuals go together over channels and
     time: below 1 its posterior is a generalised one, not Bayes' (Bissiri, Holmes & Walker, *A
     general framework for updating belief distributions*, JRSS B 78, 2016). Share of the prior and
-    information are those under which movements left out are most probable after their first
+    information are those under which held-out movements are most probable after their first
     quarter, alignment, synergies, mean and noise made without them; windows of one movement are
     left out together. Data are standardised before, all training movements together.
 
@@ -138,11 +138,16 @@ class ProMP(nn.Module):
         c = self.config
         return Preparation(c.kind, c.kernels, c.synergies, c.period)
 
+    @property
+    def expected(self) -> Expected:
+        """Timings that a new movement may have."""
+        return Expected.stored(self.config.kind, self.units, self.offsets)
+
     def condition(self, data: Sequences | Pairs) -> None:
         """Learn p(w), the noise, and the durations or the period of the movements."""
         movements = movements_of("promp", data, self.dtype)
         if len(movements) < 2:
-            raise ValueError("promp needs at least 2 movements for their spread; got 1")
+            raise ValueError("promp needs at least 2 movements to see how they differ; got 1")
         rows = zip(movements.values, movements.mask, movements.lengths.tolist(), strict=True)
         inside = [(x[:n], seen[:n]) for x, seen, n in rows]
         self.reached = extremes(movements.values, movements.mask)
@@ -153,7 +158,7 @@ class ProMP(nn.Module):
 
     def forward(self, batch: Batch) -> Float[Tensor, "*sample sequence frame channel"]:
         """The generative program of the whole movements of ``batch``."""
-        given = self._given(self._whole(batch.movements.shape[1]))
+        given = self._given(self.expected.whole(batch.movements.shape[1]))
         bases = [given.basis(batch.movements.shape[1], t) for t in given.timings]
         phases, prior = torch.stack([b.phases for b in bases]), given.prior
         rows, like = torch.arange(len(batch.movements)), torch.ones_like
@@ -183,14 +188,15 @@ class ProMP(nn.Module):
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Paths of the weights that the movements have, at their likeliest timing."""
         check_fitted("promp", self.mean)
-        given = self._given(self._whole(batch.values.shape[1]), whole=True)
+        given = self._given(self.expected.whole(batch.values.shape[1]), whole=True)
         x = batch.values - self.offset
         return self._as_predictive(given.filled(x, seen_entries(batch), 1), draws)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The paths given the entries observed."""
         check_fitted("promp", self.mean)
-        given, x = self._given(self._whole(batch.values.shape[1])), batch.values - self.offset
+        given = self._given(self.expected.whole(batch.values.shape[1]))
+        x = batch.values - self.offset
         return self._as_predictive(given.filled(x, seen_entries(batch), COMPONENTS), draws)
 
     def forecast(
@@ -201,7 +207,7 @@ class ProMP(nn.Module):
         pad, known = (0, 0, 0, horizon), batch.values.shape[1]
         x = functional.pad(batch.values - self.offset, pad)
         seen = functional.pad(seen_entries(batch), pad)
-        parts = self._given(self._timings(known)).filled(x, seen, COMPONENTS)
+        parts = self._given(self.expected.lasting(known)).filled(x, seen, COMPONENTS)
         return self._as_predictive(parts.after(known), draws)
 
     def generate(
@@ -241,32 +247,35 @@ class ProMP(nn.Module):
         """φ and S of ``frames`` frames."""
         return self._preparation.basis(self.synergies, frames, timing)
 
-    def _keep(self, all_: Prepared, chosen: Choice, groups: int) -> None:
+    def _keep(self, all_: Prepared, chosen: WeightShrinkage, groups: int) -> None:
         c = self.config
-        found = learn(all_.single, all_.views, chosen.share, c.em_iterations, c.em_tolerance)
+        found = learn_weights(
+            all_.single, all_.views, chosen.share, c.em_iterations, c.em_tolerance
+        )
         self.synergies, self.offset = all_.synergies, all_.offset
         self.mean, self.noise = found.weights.mean, found.variance.sqrt()
         self.root = found.weights.root * inflation(groups)
         self.scales = student_scales(max(1, groups - 1), SCALES[c.kind])
         self.shrinkage = self.mean.new_tensor(chosen.share)
         self.information = self.mean.new_tensor(chosen.information)
-        self.units = self.mean.new_tensor([t.unit for t in all_.expected])
-        self.offsets = self.mean.new_tensor([t.offset for t in all_.expected])
+        self.units = self.mean.new_tensor(all_.expected.units)
+        self.offsets = self.mean.new_tensor(all_.expected.offsets)
 
-    def _given(self, timings: list[Timing], *, whole: bool = False) -> Hypotheses:
+    def _given(self, timings: list[Timing], *, whole: bool = False) -> WeightHypotheses:
         """What is possible before an entry was observed; ``whole`` entries count 1."""
-        noise = Noise(self.noise.square(), 1.0 if whole else float(self.information))
-        return Hypotheses(self.weights, noise, self.basis, timings, self.scales)
+        noise = EntryNoise(self.noise.square(), 1.0 if whole else float(self.information))
+        return WeightHypotheses(timings, self.scales, self.weights, noise, self.basis)
 
-    def _posteriors(self, batch: Batch) -> Posteriors:
-        given, x = self._given(self._whole(batch.movements.shape[1])), batch.movements - self.offset
-        return Posteriors(given, x, seen_movements(batch))
+    def _posteriors(self, batch: Batch) -> WeightPosterior:
+        given = self._given(self.expected.whole(batch.movements.shape[1]))
+        x = batch.movements - self.offset
+        return WeightPosterior(given, x, seen_movements(batch))
 
     def _demonstrated(self, batch: Batch, count: int) -> list[tuple[Timing, Weights]]:
         """The likeliest timing of every movement and the posterior of its weights."""
         if len(batch) not in (1, count):
             raise ValueError(f"onto has {len(batch)} movements; 1 or {count} are needed")
-        given = self._given(self._whole(batch.values.shape[1]), whole=True)
+        given = self._given(self.expected.whole(batch.values.shape[1]), whole=True)
         found = given.demonstrated(batch.values - self.offset, seen_entries(batch))
         return [found[i if len(batch) == count else 0] for i in range(count)]
 
@@ -274,18 +283,6 @@ class ProMP(nn.Module):
         if self.config.kind == "rhythmic":
             return weights.centred(basis, goal)
         return weights.moved(basis, goal, self.weights, SMOOTH)
-
-    def _whole(self, frames: int) -> list[Timing]:
-        """Possible timings of a complete movement of ``frames`` frames."""
-        if self.config.kind == "discrete":
-            return [Timing(max(1.0, frames - 1.0))]
-        return self._timings(frames)
-
-    def _timings(self, frames: int) -> list[Timing]:
-        """Possible timings of a movement whose first ``frames`` frames are known."""
-        timings = [Timing(*t) for t in torch.stack([self.units, self.offsets], 1).tolist()]
-        going = [t for t in timings if self.config.kind == "rhythmic" or t.unit >= frames]
-        return going or timings[-1:]
 
     def _as_predictive(self, parts: Components, draws: int) -> Predictive:
         paths = parts.draws(draws)

@@ -13,17 +13,25 @@ from torch import Tensor
 from zoo.models.primitives.alignment import BasisOf
 from zoo.models.primitives.weights import Basis, Weights
 from zoo.movement.components import alike
-from zoo.movement.rollout import Timing
-from zoo.movement.sufficient_statistics import Movements
+from zoo.movement.timing import Movements, Timing
 
-__all__ = ["Learned", "Noise", "Single", "View", "learn", "maximise", "similarity", "views_of"]
+__all__ = [
+    "EntryNoise",
+    "LearnedWeights",
+    "Single",
+    "View",
+    "learn_weights",
+    "maximise",
+    "similarity",
+    "views_of",
+]
 
 FLOOR = 1e-8
 REACH = 0.25
 
 
 @dataclass(frozen=True)
-class Noise:
+class EntryNoise:
     """σ_c², and the part of an independent observation that every entry counts."""
 
     variance: Float[Tensor, " channel"]
@@ -38,20 +46,20 @@ class Noise:
 
 @dataclass(frozen=True)
 class View:
-    """Movements ``rows`` with one basis and the same entries seen; ``x`` is 0 where unseen."""
+    """Movements ``rows`` with one basis and the same entries observed; ``x`` is 0 where unseen."""
 
     rows: Int[Tensor, " sequence"]
     basis: Basis
     seen: Bool[Tensor, "time channel"]
     x: Float[Tensor, "sequence time channel"]
 
-    def likelihood(self, noise: Noise) -> tuple[Tensor, Tensor]:
+    def likelihood(self, noise: EntryNoise) -> tuple[Tensor, Tensor]:
         """A and b of every movement."""
         counts = noise.precision
         return self.basis.precision(self.seen * counts), self.basis.linear(self.x * counts)
 
     def log_density(
-        self, prior: Weights, noise: Noise, scales: Float[Tensor, " scale"] | None = None
+        self, prior: Weights, noise: EntryNoise, scales: Float[Tensor, " scale"] | None = None
     ) -> Float[Tensor, "scale sequence"]:
         """Log p(x_observed) of every movement for w ~ N(μ, s²Σ); s = 1 without ``scales``."""
         s = self.x.new_ones(1) if scales is None else scales
@@ -67,7 +75,7 @@ class View:
         frames, channels = self.seen.any(1), self.seen.any(0)
         return bool((self.seen == frames[:, None] & channels).all())
 
-    def _compressed(self, prior: Weights, noise: Noise, scales: Tensor) -> Tensor:
+    def _compressed(self, prior: Weights, noise: EntryNoise, scales: Tensor) -> Tensor:
         """The same density by the part of x that w explains: φ = QR of the frames observed."""
         frames, channels = self.seen.any(1), self.seen.any(0)
         deviation = noise.precision[channels].sqrt()
@@ -84,7 +92,7 @@ class View:
         density: Tensor = -(square + rest + volume[:, None] + len(q) * entries) / 2
         return density
 
-    def posterior(self, prior: Weights, noise: Noise) -> Weights:
+    def posterior(self, prior: Weights, noise: EntryNoise) -> Weights:
         """p(w | x_observed) of every movement."""
         return prior.condition(*self.likelihood(noise))
 
@@ -103,7 +111,7 @@ def _gaussian(cover: Tensor, error: Tensor, scales: Tensor) -> tuple[Tensor, Ten
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedWeights:
     """p(w), σ², and the objective after every iteration."""
 
     weights: Weights
@@ -120,16 +128,16 @@ class Single:
     target: Float[Tensor, "weight weight"]
 
     @classmethod
-    def of(cls, views: Sequence[View], alike: Float[Tensor, "kernel kernel"]) -> Single:
-        """Every movement for itself; ``alike`` is the correlation of neighbouring kernels."""
+    def of(cls, views: Sequence[View], correlation: Float[Tensor, "kernel kernel"]) -> Single:
+        """Every movement for itself; ``correlation`` is that of neighbouring kernels."""
         size = views[0].x.new_ones(views[0].x.shape[-1])
-        prior = Weights(*_pooled(views, Noise(size)))
-        found = _expect(views, prior, Noise(1e-2 * size))
+        prior = Weights(*_pooled(views, EntryNoise(size)))
+        found = _expect(views, prior, EntryNoise(1e-2 * size))
         count = torch.as_tensor(sum(len(v.rows) * v.seen.sum(0) for v in views)).clamp(min=1)
-        spread = found.covariance / len(found.mean) + FLOOR * torch.eye(len(prior.mean))
-        weights = Weights(found.mean, torch.linalg.cholesky(spread))
+        covariance = found.covariance / len(found.mean) + FLOOR * torch.eye(len(prior.mean))
+        weights = Weights(found.mean, torch.linalg.cholesky(covariance))
         variance = (found.energy / count).clamp_min(FLOOR)
-        return cls(weights, variance, _target(found.mean, alike))
+        return cls(weights, variance, _target(found.mean, correlation))
 
     def population(self, share: float) -> Weights:
         """N(μ, Σ) of the movements, of which Σ₀ has that ``share``."""
@@ -175,9 +183,9 @@ def similarity(kernels: int, *, circular: bool) -> Float[Tensor, "kernel kernel"
     return torch.exp(-apart / (REACH * kernels))
 
 
-def learn(
+def learn_weights(
     single: Single, views: Sequence[View], share: float, iterations: int, tolerance: float
-) -> Learned:
+) -> LearnedWeights:
     """p(w) and σ² of several movements, whose own weights are known.
 
     Σ₀ is the scale of an inverse-Wishart prior that counts as much as ``share`` of all evidence on
@@ -196,8 +204,8 @@ def maximise(
     strength: float,
     iterations: int,
     tolerance: float,
-) -> Learned:
-    """EM from ``weights`` until an iteration gains less than ``tolerance`` nats a seen entry.
+) -> LearnedWeights:
+    """EM from ``weights`` until an iteration gains less than ``tolerance`` nats an observed entry.
 
     The objective is Σ log p(x) − λ/2 (log|Σ| + tr Σ₀Σ⁻¹), with λ ``strength`` and Σ₀ ``target``.
     """
@@ -205,7 +213,7 @@ def maximise(
     entries, objective = float(torch.as_tensor(count).sum()), list[float]()
     movements = sum(len(v.rows) for v in views)
     for _ in range(iterations):
-        found = _expect(views, weights, Noise(variance))
+        found = _expect(views, weights, EntryNoise(variance))
         objective.append(float(found.log_density - _penalty(weights, target, strength)))
         if len(objective) > 1 and objective[-1] - objective[-2] < tolerance * entries:
             break
@@ -214,21 +222,21 @@ def maximise(
         total = found.covariance + scatter + strength * target
         weights = Weights(mean, torch.linalg.cholesky(total / (movements + strength)))
         variance = (found.energy / torch.as_tensor(count).clamp(min=1)).clamp_min(FLOOR)
-    return Learned(weights, variance, tuple(objective))
+    return LearnedWeights(weights, variance, tuple(objective))
 
 
-def _expect(views: Sequence[View], prior: Weights, noise: Noise) -> _Expected:
+def _expect(views: Sequence[View], prior: Weights, noise: EntryNoise) -> _Expected:
     movements = sum(len(v.rows) for v in views)
     mean = prior.mean.new_zeros(movements, prior.mean.shape[-1])
     covariance, energy = torch.zeros_like(prior.root), torch.zeros_like(noise.variance)
     log_density = noise.variance.new_zeros(())
     for view in views:
         posterior = view.posterior(prior, noise)
-        path, spread = posterior.moments(view.basis)
+        path, variance = posterior.moments(view.basis)
         mean[view.rows] = posterior.mean
         covariance = covariance + len(view.rows) * posterior.covariance
         error = (view.x - path * view.seen).square().sum((0, 1))
-        energy = energy + error + len(view.rows) * (spread * view.seen).sum(0)
+        energy = energy + error + len(view.rows) * (variance * view.seen).sum(0)
         log_density = log_density + view.log_density(prior, noise).sum()
     return _Expected(mean, covariance, energy, log_density)
 
@@ -238,8 +246,8 @@ def _penalty(weights: Weights, target: Tensor, strength: float) -> Tensor:
     return strength * (weights.root.diagonal().log().sum() + trace / 2)
 
 
-def _pooled(views: Sequence[View], noise: Noise) -> tuple[Tensor, Tensor]:
-    """Least-squares weights of all movements together, and I as the spread about them."""
+def _pooled(views: Sequence[View], noise: EntryNoise) -> tuple[Tensor, Tensor]:
+    """Least-squares weights of all movements together, and I as the covariance about them."""
     parts = [view.likelihood(noise) for view in views]
     total = torch.stack([len(v.rows) * a for v, (a, _) in zip(views, parts, strict=True)]).sum(0)
     eye = torch.eye(len(total), dtype=total.dtype)
@@ -247,8 +255,10 @@ def _pooled(views: Sequence[View], noise: Noise) -> tuple[Tensor, Tensor]:
     return torch.linalg.solve(total + 1e-6 * total.diagonal().mean() * eye, linear), eye
 
 
-def _target(w: Float[Tensor, "sequence weight"], alike: Tensor) -> Float[Tensor, "weight weight"]:
+def _target(
+    w: Float[Tensor, "sequence weight"], correlation: Tensor
+) -> Float[Tensor, "weight weight"]:
     """Σ₀: synergies are independent, each of its own size; neighbouring kernels go together."""
-    deviation = (w - w.mean(0)).unflatten(1, (-1, len(alike)))
-    size = deviation.square().sum((0, 2)) / ((len(w) - 1) * len(alike))
-    return torch.kron(size.clamp_min(FLOOR).diag(), alike)
+    deviation = (w - w.mean(0)).unflatten(1, (-1, len(correlation)))
+    size = deviation.square().sum((0, 2)) / ((len(w) - 1) * len(correlation))
+    return torch.kron(size.clamp_min(FLOOR).diag(), correlation)

@@ -4,7 +4,7 @@ A movement is linear in one weight vector w of basis functions and synergies::
 
     w ~ N(μ, Σ),   y_tc = Σ_jk S_cj φ_k(t) w_jk,   x_tc ~ N(y_tc, σ_c²)
 
-so that every set of seen entries is a Gaussian likelihood exp(−½ wᵀAw + bᵀw).
+so that every set of observed entries is a Gaussian likelihood exp(−½ wᵀAw + bᵀw).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Basis:
         return y
 
     def precision(self, weight: Float[Tensor, "time channel"]) -> Float[Tensor, "weight weight"]:
-        """A of entries that count ``weight``, 1/σ² where they were seen and 0 elsewhere."""
+        """A of entries that count ``weight``, 1/σ² where they were observed and 0 elsewhere."""
         s, φ = self.synergies, self.phases
         gram = torch.einsum("tc,ci,cj->tij", weight, s, s).flatten(1)
         kernel = (φ[:, :, None] * φ[:, None, :]).flatten(1)

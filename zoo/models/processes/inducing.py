@@ -18,7 +18,7 @@ from zoo.models.processes.covariances import Name
 from zoo.models.processes.kernels import squared_distances
 from zoo.types import Batch, Layout
 
-__all__ = ["Config", "Training", "View", "warn_of_divergence"]
+__all__ = ["Config", "ProjectedItems", "Training", "warn_of_divergence"]
 
 
 @settings
@@ -106,7 +106,7 @@ class Training(NamedTuple):
 
 
 @dataclass(frozen=True)
-class View:
+class ProjectedItems:
     """Items whose y given u = σ_f L v is N(σ_f Vᵀv, σ_f² ``diagonal``), in units of σ_f².
 
     ``factor`` is L, ``projection`` V = L⁻¹K_uf, ``left`` diag(K − Q), which is 1 − diag VᵀV.
@@ -127,7 +127,7 @@ class View:
         k_uf: Float[Tensor, "inducing item"],
         noise: Float[Tensor, ""],
         bound: Literal["fitc", "vfe"],
-    ) -> View:
+    ) -> ProjectedItems:
         """The items of ``batch`` under FITC or VFE, with covariances of unit signal variance."""
         factor = torch.linalg.cholesky(k_uu)
         projection = torch.linalg.solve_triangular(factor, k_uf, upper=False)

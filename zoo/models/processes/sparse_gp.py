@@ -10,25 +10,25 @@ import pyro
 import pyro.distributions as dist
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from zoo.contract.strategies import MarginalLikelihood
 from zoo.datasets.records import Pairs, Sequences
 from zoo.errors import NotFittedError
 from zoo.inference.marginal import evaluator, maximise
 from zoo.models.processes.collapsed import Collapsed
-from zoo.models.processes.covariances import learned_shape, stationary
-from zoo.models.processes.evidence import pairs_of, patterns
+from zoo.models.processes.evidence import patterns
 from zoo.models.processes.gaussian import joint_draws, white_posterior
-from zoo.models.processes.inducing import Config, Training, View, warn_of_divergence
-from zoo.models.processes.kernels import median_distance, squared_distances, squared_exponential
+from zoo.models.processes.hyperparameters import InducingInputs
+from zoo.models.processes.inducing import Config, ProjectedItems, Training, warn_of_divergence
+from zoo.models.processes.kernels import squared_distances, squared_exponential
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Sites
 
 __all__ = ["Config", "SparseGaussianProcess"]
 
 
-class SparseGaussianProcess(nn.Module):
+class SparseGaussianProcess(InducingInputs):
     """A Gaussian process for each target, seen through u = f(x̄) at m inducing inputs x̄.
 
     ``u ~ N(0, K_uu)``, ``f_p | u`` as the Gaussian process has it, and
@@ -50,11 +50,8 @@ class SparseGaussianProcess(nn.Module):
     no joint distribution over targets.
     """
 
-    config_class: ClassVar[type] = Config
     global_sites: ClassVar[tuple[str, ...]] = ("v",)
-    dtype: ClassVar[torch.dtype] = torch.float64
 
-    inducing: Tensor
     factor: Tensor
     root: Tensor
     mean: Tensor
@@ -63,38 +60,10 @@ class SparseGaussianProcess(nn.Module):
 
     def __init__(self, layout: Layout, config: Config) -> None:
         """Hyperparameters for the layout's features; data come by ``condition``."""
-        super().__init__()
-        self.layout, self.config = layout, config
-        lengths = len(layout.inputs) if config.ard else 1
-        self.log_length = nn.Parameter(torch.zeros(lengths, dtype=self.dtype))
-        self.log_noise = nn.Parameter(torch.zeros((), dtype=self.dtype))
-        signal = torch.zeros(len(layout.channels), dtype=self.dtype)
-        self.log_signal = nn.Parameter(signal, requires_grad=False)
-        self.log_shape = learned_shape(config.kernel)
-        self._set_inducing(torch.empty(0, dtype=self.dtype))
+        super().__init__(layout, config)
         for name in ("factor", "root", "mean", "pattern", "other_noise"):
             self.register_buffer(name, torch.empty(0, dtype=self.dtype))
         self._training: Training | None = None
-
-    @property
-    def length(self) -> Float[Tensor, " feature"]:
-        """Length scales l."""
-        return self.log_length.exp()
-
-    @property
-    def noise(self) -> Float[Tensor, ""]:
-        """Noise ratio σ_n²/σ_f²."""
-        return self.config.noise_floor + self.log_noise.exp()
-
-    @property
-    def signal(self) -> Float[Tensor, " target"]:
-        """Signal variance σ_f² of every target."""
-        return self.log_signal.exp()
-
-    @property
-    def noise_std(self) -> Float[Tensor, " target"]:
-        """σ_n of every target."""
-        return (self.noise * self.signal).sqrt().detach()
 
     def condition(self, data: Sequences | Pairs) -> None:
         """Take in the training pairs, draw inducing inputs, compute their distances once."""
@@ -139,7 +108,7 @@ class SparseGaussianProcess(nn.Module):
 
     @torch.no_grad()
     def regress(self, inputs: Float[Tensor, "item feature"], *, draws: int) -> Predictive:
-        """Mean, latent and noise spread of every target; joint draws over not too many items."""
+        """Mean and standard deviations of every target; joint draws over not too many items."""
         k = self._kernel(self.inducing, inputs)
         v = torch.linalg.solve_triangular(self.factor, k, upper=False)
         mean = v.mT @ self.mean
@@ -166,17 +135,17 @@ class SparseGaussianProcess(nn.Module):
 
         With ``bound="vfe"`` the factor −tr(K − Q)/2σ_n² belongs to it.
         """
-        view, scale = self._view(batch), self.signal.sqrt()[:, None]
+        items, scale = self._items(batch), self.signal.sqrt()[:, None]
         unit = dist.Normal(torch.zeros_like(scale), 1.0)
         with pyro.plate("targets", len(scale)):
-            v = pyro.sample("v", unit.expand([len(scale), len(view.factor)]).to_event(1))
-            pyro.deterministic("u", scale * (v @ view.factor.mT), event_dim=1)
-            law = dist.Normal(scale * (v @ view.projection), scale * view.diagonal.sqrt())
+            v = pyro.sample("v", unit.expand([len(scale), len(items.factor)]).to_event(1))
+            pyro.deterministic("u", scale * (v @ items.factor.mT), event_dim=1)
+            law = dist.Normal(scale * (v @ items.projection), scale * items.diagonal.sqrt())
             with pyro.poutine.scale(scale=batch.total / len(batch)):
-                site = law.mask(view.mask).to_event(1)
-                y: Tensor = pyro.sample("y", site, obs=batch.given(view.y))
+                site = law.mask(items.mask).to_event(1)
+                y: Tensor = pyro.sample("y", site, obs=batch.given(items.y))
                 if self.config.bound == "vfe":
-                    trace = (view.left * view.mask).sum(-1) / (2 * self.noise)
+                    trace = (items.left * items.mask).sum(-1) / (2 * self.noise)
                     pyro.factor("trace", -trace)
         return y
 
@@ -184,9 +153,9 @@ class SparseGaussianProcess(nn.Module):
         """The best q(v) of all items: p(v | y) of FITC, the optimum of VFE's bound."""
         if len(batch) != batch.total:
             raise ValueError(f"q(u) needs all {batch.total} items at once; got {len(batch)}")
-        view = self._view(batch)
-        y = view.y / self.signal.sqrt()[:, None]
-        mean, root = white_posterior(view.projection, view.mask / view.diagonal, y)
+        items = self._items(batch)
+        y = items.y / self.signal.sqrt()[:, None]
+        mean, root = white_posterior(items.projection, items.mask / items.diagonal, y)
         v = dist.MultivariateNormal(mean, scale_tril=root)
         return Sites(plate="targets", size=len(y), rows=len(y), of={"v": lambda _: v})
 
@@ -202,35 +171,14 @@ class SparseGaussianProcess(nn.Module):
             "noise_std_vfe": self.other_noise.tolist(),
         }
 
-    def _begin(self, data: Sequences | Pairs) -> Pairs:
-        """Draw inducing inputs; start at their median distance and the configured noise."""
-        data = pairs_of(data)
-        known = data.mask.any(1).nonzero()[:, 0]
-        order = torch.randperm(len(known), device=known.device)[: self.config.count(len(known))]
-        self._set_inducing(data.inputs[known[order]].to(self.dtype))
-        inducing = self.inducing.detach()
-        among = squared_distances(inducing, inducing).fill_diagonal_(0)
-        with torch.no_grad():
-            self.log_length.fill_(median_distance(among).log())
-            self.log_noise.fill_(self.config.noise - self.config.noise_floor).log_()
-            if self.log_shape is not None:
-                self.log_shape.zero_()
-        return data
-
-    def _view(self, batch: Batch) -> View:
+    def _items(self, batch: Batch) -> ProjectedItems:
         if self.inducing.numel() == 0:
             raise NotFittedError("there are no inducing inputs yet; call zoo.fit first")
         if batch.inputs is None:
             raise ValueError("a Gaussian process needs items with inputs; got none")
         k_uu = self._jittered(self._kernel(self.inducing, self.inducing))
         k_uf = self._kernel(self.inducing, batch.inputs.flatten(1))
-        return View.of(batch, k_uu, k_uf, self.noise, self.config.bound)
-
-    def _set_inducing(self, inputs: Tensor) -> None:
-        if self.config.learn_inducing:
-            self.inducing = nn.Parameter(inputs.clone())
-        else:
-            self.register_buffer("inducing", inputs)
+        return ProjectedItems.of(batch, k_uu, k_uf, self.noise, self.config.bound)
 
     def _need_training(self) -> Training:
         if self._training is None:
@@ -261,13 +209,6 @@ class SparseGaussianProcess(nn.Module):
         k_uu, k_fu = self._covariances(training)
         factor = torch.linalg.cholesky(k_uu)
         return factor, torch.linalg.solve_triangular(factor, k_fu.mT, upper=False).mT
-
-    def _jittered(self, k_uu: Tensor) -> Tensor:
-        return k_uu + torch.diag(k_uu.new_full((len(k_uu),), self.config.jitter))
-
-    def _kernel(self, a: Tensor, b: Tensor) -> Tensor:
-        shape = None if self.log_shape is None else self.log_shape.exp()
-        return stationary(self.config.kernel, a, b, self.length, shape)
 
     @torch.no_grad()
     def _keep_posterior(self, training: Training) -> None:
@@ -303,14 +244,6 @@ class SparseGaussianProcess(nn.Module):
         All at once from a poor start, the inputs settle in a far worse optimum.
         """
         self._start_at(self._fixed(self.config.bound, ard=False))
-
-    @torch.no_grad()
-    def _start_at(self, other: SparseGaussianProcess) -> None:
-        """The hyperparameters of ``other``; its first length scale where both have not as many."""
-        self.log_length.copy_(other.log_length[: len(self.log_length)])
-        self.log_noise.copy_(other.log_noise)
-        if self.log_shape is not None and other.log_shape is not None:
-            self.log_shape.copy_(other.log_shape)
 
     def _compare(self) -> None:
         """Fit the variational bound from here and compare the noise."""

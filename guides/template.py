@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from zoo.movement.timing import aligned
+
 __all__ = ["ROWS", "fourier", "learn_template", "match"]
 
 HARMONICS = 5
@@ -22,7 +24,7 @@ DIRECTIONS = 16
 TEMPOS = (0.0, -0.07, 0.07, -0.14, 0.14, -0.21, 0.21)
 FRAMES_A_PERIOD = 24
 ROUNDS, NEWTON = 5, 6
-SPREAD = 0.1
+TEMPO_STD = 0.1
 RIDGE = 1e-6
 
 
@@ -42,13 +44,15 @@ def learn_template(
     mask: Bool[Tensor, "sequence time channel"],
     period: float,
 ) -> Float[Tensor, "row channel"]:
-    """T of some movements: that of the one with most entries seen first, then of all in turn."""
+    """T of some movements: of the one with most entries observed first, then of all in turn."""
     first = int(mask.sum((1, 2)).argmax())
     still = x.new_zeros(1, 2)
-    template = _fitted(x[first, None], mask[first, None], still, period)
-    for _ in range(ROUNDS):
-        template = _fitted(x, mask, match(x, mask, template, period), period)
-    return template
+
+    def fitted(timing: Tensor) -> Tensor:
+        return _fitted(x, mask, timing, period)
+
+    alone = _fitted(x[first, None], mask[first, None], still, period)
+    return fitted(aligned(alone, fitted, lambda template: match(x, mask, template, period), ROUNDS))
 
 
 def match(
@@ -101,7 +105,7 @@ def _improved(
     weight = torch.stack([torch.ones_like(along), along], dim=-1)
     gram = torch.einsum("st,sti,stj->sij", slope.square().sum(-1), weight, weight)
     pull = torch.einsum("st,sti->si", (slope * error).sum(-1), weight)
-    noise = error.square().sum((1, 2)) / seen.sum((1, 2)).clamp(min=1) / SPREAD**2
+    noise = error.square().sum((1, 2)) / seen.sum((1, 2)).clamp(min=1) / TEMPO_STD**2
     gram = gram + torch.diag_embed(torch.stack([RIDGE + 0 * noise, RIDGE + noise], dim=1))
     pull = pull - torch.stack([0 * noise, noise * λ], dim=1)
     move = torch.linalg.solve(gram, pull[..., None])[..., 0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -13,22 +12,16 @@ FLOOR = 1e-8
 GRID = 121
 ENTRIES = 2**18
 
-__all__ = ["Weights", "conjugate_weights"]
+__all__ = ["FLOOR", "ConjugateWeights", "conjugate_weights"]
 
 
 @dataclass(frozen=True)
-class Weights:
-    """Posterior w_ic ~ N(mean, noise · covariance) with the variances that explain the data best.
-
-    ``noise`` is σ² and ``prior`` the variance of w, of every channel; ``covariance`` is in units of
-    σ².
-    """
+class ConjugateWeights:
+    """Posterior w_ic ~ N(mean, noise · covariance), with the σ² ``noise`` of every channel."""
 
     mean: Float[Tensor, "sequence channel kernel"]
     covariance: Float[Tensor, "#sequence channel kernel kernel"]
     noise: Float[Tensor, " channel"]
-    prior: Float[Tensor, " channel"]
-    log_evidence: Float[Tensor, " channel"]
 
 
 def conjugate_weights(
@@ -36,13 +29,12 @@ def conjugate_weights(
     linear: Float[Tensor, "sequence channel kernel"],
     square: Float[Tensor, "sequence channel"],
     count: Float[Tensor, "sequence #channel"],
-    log_volume: Float[Tensor, "sequence #channel"],
-) -> Weights:
+) -> ConjugateWeights:
     """Posterior of the weights of every movement; noise and prior are shared by all movements.
 
-    With white residuals r = x̃ − Φw, ``precision`` is ΦᵀΦ, ``linear`` Φᵀx̃, ``square`` x̃ᵀx̃ and
-    ``log_volume`` what whitening adds to the log density. For every λ = σ²/τ² the best σ² is
-    Σ(‖r‖² + λ‖w‖²)/Σn; λ is the best of a fine grid, of every channel. σ² stays above 1e-8.
+    With white residuals r = x̃ − Φw, w ~ N(0, τ²I), ``precision`` is ΦᵀΦ, ``linear`` Φᵀx̃ and
+    ``square`` x̃ᵀx̃. For every λ = σ²/τ² the best σ² is Σ(‖r‖² + λ‖w‖²)/Σn; λ has the highest
+    evidence on a fine grid, of every channel. σ² stays above 1e-8.
     """
     values, vectors = torch.linalg.eigh(precision)
     s = values.clamp_min(0)
@@ -55,15 +47,10 @@ def conjugate_weights(
     λ = grid[torch.cat(scores, -1).argmax(-1)]
     shrunk = s + λ[:, None]
     energy = (square - (β.square() / shrunk).sum(-1)).clamp_min(0)
-    noise = (energy.sum(0) / total).clamp_min(FLOOR)
-    volume = (shrunk / λ[:, None]).log().sum(-1) / 2 + log_volume
-    each = energy / noise / 2 + count / 2 * (2 * math.pi * noise).log() + volume
-    return Weights(
+    return ConjugateWeights(
         mean=(vectors @ (β / shrunk)[..., None])[..., 0],
         covariance=(vectors / shrunk[..., None, :]) @ vectors.mT,
-        noise=noise,
-        prior=noise / λ,
-        log_evidence=-each.sum(0),
+        noise=(energy.sum(0) / total).clamp_min(FLOOR),
     )
 
 

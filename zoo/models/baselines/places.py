@@ -1,24 +1,8 @@
-"""Which training movements are held out together, and where their forecasts begin."""
+"""Where forecasts of held-out movements begin."""
 
 from __future__ import annotations
 
-from jaxtyping import Int
-from torch import Tensor
-
-__all__ = ["folds_of", "places", "starts"]
-
-FOLDS = 4
-
-
-def folds_of(group: Int[Tensor, " sequence"]) -> Int[Tensor, " sequence"]:
-    """At most four folds, whole groups in turn.
-
-    >>> import torch
-    >>> folds_of(torch.tensor([7, 7, 2, 5, 9, 1])).tolist()
-    [0, 0, 1, 2, 3, 0]
-    """
-    order = list(dict.fromkeys(group.tolist()))
-    return group.new_tensor([order.index(g) % FOLDS for g in group.tolist()])
+__all__ = ["places", "starts"]
 
 
 def starts(frames: int) -> list[int]:

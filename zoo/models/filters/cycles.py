@@ -1,4 +1,4 @@
-r"""Gaussian mixtures over latent limit cycles of unknown timing, conditioned on the frames seen.
+r"""Gaussian mixtures over latent limit cycles of unknown timing, given the frames observed.
 
     z = Φ(τ) u + r,   r ~ GP(0, ν N),   y_t ~ N(z_t, E)
     τ ~ equally likely timings,   u ~ 1/M Σ_i N(ū + √(1−h²)(u_i − ū), B)
@@ -10,10 +10,9 @@ stationary covariance of what such cycles leave of the movements known.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,41 +20,35 @@ from torch import Tensor
 
 from zoo.movement.components import resample
 from zoo.movement.gaussian_paths import block_diagonal, cholesky, stationary, stationary_draws
+from zoo.movement.kernel_mixture import KernelMixture
 from zoo.movement.paths import Readout
 
 __all__ = ["Cycle", "CyclePrior", "Cycles", "Glimpse"]
 
-CHOICES = {
-    "bandwidth": (0.1, 0.3, 0.6, 1.0),
-    "shrinkage": (0.01, 0.1, 0.5),
-    "process": (0.1, 0.3, 1.0),
-}
-LEFT_OUT, DRAWS = 4, 64
+DRAWS = 64
 ROWS = 16
 
 
 @dataclass(frozen=True)
-class CyclePrior:
+class CyclePrior(KernelMixture):
     """The mixture: one component for every timing and every known movement's parameters u_i."""
 
     designs: Float[Tensor, "timing time row"]
     parameters: Float[Tensor, "movement row latent"]
     residuals: Float[Tensor, "recording frame latent"]
     observation: Float[Tensor, "latent latent"]
-    bandwidth: float = 0.3
-    shrinkage: float = 0.1
-    process: float = 1.0
 
-    @property
-    def shape(self) -> tuple[float, float, float]:
-        """h, λ and ν."""
-        return self.bandwidth, self.shrinkage, self.process
+    grids: ClassVar[Mapping[str, Sequence[float]]] = {
+        "bandwidth": (0.1, 0.3, 0.6, 1.0),
+        "shrinkage": (0.01, 0.1, 0.5),
+        "process": (0.1, 0.3, 1.0),
+    }
+    judged: ClassVar[int] = 4
 
     @property
     def means(self) -> Float[Tensor, "movement parameter"]:
         """Means of u."""
-        u = self.parameters.flatten(1)
-        return u.mean(0) + math.sqrt(1 - self.bandwidth**2) * (u - u.mean(0))
+        return self.centred(self.parameters.flatten(1))
 
     @property
     def root(self) -> Float[Tensor, "parameter parameter"]:
@@ -64,9 +57,9 @@ class CyclePrior:
         apart = u - u.mean(0) if len(u) > 1 else u
         size = apart.square().mean(0)
         size[:-1] = size[:-1].mean(0)
-        spread = torch.diag(size.flatten())
+        independent = torch.diag(size.flatten())
         shared = apart.flatten(1).mT @ apart.flatten(1) / max(1, len(u) - 1)
-        mixed = torch.lerp(shared, spread, self.shrinkage if len(u) > 1 else 1.0)
+        mixed = torch.lerp(shared, independent, self.shrinkage if len(u) > 1 else 1.0)
         return self.bandwidth * cholesky(mixed)
 
     def glimpse(
@@ -113,55 +106,28 @@ class CyclePrior:
         paths: Float[Tensor, "movement time latent"],
         seen: Sequence[int],
         readout: Readout,
-        without: Callable[[int], CyclePrior],
+        without: Callable[[int], Self],
     ) -> Self:
-        """The h, λ and ν under which the futures of movements left out are forecast best.
+        """The h, λ and ν under which held-out ``paths`` are forecast best, after ``seen`` frames.
 
-        ``without`` gives the prior of all movements but one; ``readout`` judges draws frame by
-        frame and channel by channel; the three are chosen in turn. Fewer than three movements
-        leave too little to compare: the defaults stay.
+        ``readout`` judges draws frame by frame and channel by channel, as Gaussians. What depends
+        on the movement, ν and the frames observed alone is kept.
         """
-        if len(paths) < 3:
-            return self
-        rows = torch.linspace(0, len(paths) - 1, min(len(paths), LEFT_OUT)).round().long()
-        others = {i: without(i) for i in rows.tolist()}
-        best, known = self, dict[tuple[int, float, int], Glimpse]()
-        for name in (*CHOICES, "bandwidth"):
-            options = [best._with(name, value) for value in CHOICES[name]]
-            best = max(options, key=lambda p: p.left_out(paths, seen, readout, others, known))
-        return best
+        time = torch.arange(paths.shape[1])
+        known = dict[tuple[int, float, int], Glimpse]()
 
-    def left_out(
-        self,
-        paths: Float[Tensor, "movement time latent"],
-        seen: Sequence[int],
-        readout: Readout,
-        others: Mapping[int, CyclePrior],
-        known: dict[tuple[int, float, int], Glimpse],
-    ) -> float:
-        """Mean log density of movements' futures under the others, of the same h, λ and ν.
+        def density(rest: CyclePrior, i: int, k: int) -> Tensor:
+            at = (i, rest.process, k)
+            known[at] = known[at] if at in known else rest.glimpse(time < k)
+            drawn = rest.given(known[at], paths[i][None]).sample(DRAWS)[:, 0]
+            return readout.of(i).density_of_draws(drawn - paths[i])
 
-        ``known`` keeps what only depends on the movement, ν and the frames seen.
-        """
-        h, λ, ν = self.shape
-        total = 0.0
-        for i, rest in others.items():
-            prior = replace(rest, bandwidth=h, shrinkage=λ, process=ν)
-            for k in seen:
-                if (i, ν, k) not in known:
-                    known[i, ν, k] = prior.glimpse(torch.arange(paths.shape[1]) < k)
-                drawn = prior.given(known[i, ν, k], paths[i][None]).sample(DRAWS)[:, 0]
-                total += float(readout.of(i).density_of_draws(drawn - paths[i])[k:].mean())
-        return total / (len(others) * len(seen))
-
-    def _with(self, name: str, value: float) -> Self:
-        change: dict[str, Any] = {name: value}
-        return replace(self, **change)
+        return self.tuned_on(len(paths), seen, without, density)
 
 
 @dataclass(frozen=True)
 class Glimpse:
-    """The frames seen, whitened by C = ν N + E: designs, and how r elsewhere follows."""
+    """The frames observed, whitened by C = ν N + E: designs, and how r elsewhere follows."""
 
     rows: Int[Tensor, " seen"]
     unroot: Float[Tensor, "seen seen"]
@@ -186,14 +152,14 @@ class Glimpse:
         return cls(rows, unroot, white, white.mT @ white, unroot @ N[rows], noise_root)
 
     def white(self, y: Float[Tensor, "*batch time latent"]) -> Float[Tensor, "*batch seen"]:
-        """What was seen, whitened."""
+        """What was observed, whitened."""
         whitened: Tensor = y.flatten(-2)[..., self.rows] @ self.unroot.mT
         return whitened
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """The mixture after some sequences were seen in the same frames."""
+    """The mixture after some sequences were observed in the same frames."""
 
     prior: CyclePrior
     glimpse: Glimpse
@@ -203,7 +169,7 @@ class Cycle:
     log_weights: Float[Tensor, "sequence timing movement"]
 
     def sample(self, draws: int) -> Float[Tensor, "sample sequence time latent"]:
-        """Joint draws of whole paths; r is drawn unseen and then corrected by what was seen."""
+        """Joint draws of whole paths; r is drawn, then corrected by what was observed."""
         path, prior = self._cycles(draws), self.prior
         r = stationary_draws(prior.residuals, path.shape[2], (draws, len(self.seen)))
         path = path + prior.process**0.5 * r

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -20,23 +19,27 @@ from torch import Tensor
 
 from zoo.movement.forcing import trajectory_matrix
 from zoo.movement.response import Response, Transformation, discrete_basis, phase, rhythmic_basis
+from zoo.movement.timing import Kind, Timing
 
-__all__ = ["Primitive", "Timing", "roll_out"]
+__all__ = ["Primitive", "kernel_values", "roll_out"]
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Frames in a movement's unit of time (its duration or its period) and the phase at frame 0."""
-
-    unit: float
-    offset: float = 0.0
+def kernel_values(
+    kind: Kind, kernels: int, frames: int, timing: Timing, *, normalised: bool = True
+) -> Float[Tensor, "frame kernel"]:
+    """Ψ_i/ΣΨ of every frame, or Ψ_i."""
+    time = torch.arange(frames, dtype=torch.float64)
+    if kind == "discrete":
+        return discrete_basis(time, kernels=kernels, duration=timing.unit, normalised=normalised)
+    unit, at = timing.unit, timing.offset
+    return rhythmic_basis(time, kernels=kernels, period=unit, offset=at, normalised=normalised)
 
 
 @dataclass(frozen=True)
 class Primitive:
     """Constants of a movement primitive whose unit of time is its duration or its period."""
 
-    kind: Literal["discrete", "rhythmic"]
+    kind: Kind
     kernels: int
     alpha: float
     beta: float
@@ -52,21 +55,6 @@ class Primitive:
             )
         return system
 
-    def kernel_values(self, frames: int, timing: Timing, *, normalised: bool = True) -> Tensor:
-        """Ψ_i of every frame, without the gate."""
-        time = torch.arange(frames, dtype=torch.float64)
-        if self.kind == "discrete":
-            return discrete_basis(
-                time, kernels=self.kernels, duration=timing.unit, normalised=normalised
-            )
-        return rhythmic_basis(
-            time,
-            kernels=self.kernels,
-            period=timing.unit,
-            offset=timing.offset,
-            normalised=normalised,
-        )
-
     def gate(self, frames: int, timing: Timing) -> Float[Tensor, " frame"]:
         """ξ of every frame: the phase s where the forcing term is gated, else 1."""
         time = torch.arange(frames, dtype=torch.float64)
@@ -74,7 +62,9 @@ class Primitive:
 
     def basis(self, frames: int, timing: Timing) -> Float[Tensor, "frame kernel"]:
         """ξ Ψ/ΣΨ of every frame."""
-        return self.gate(frames, timing)[:, None] * self.kernel_values(frames, timing)
+        return self.gate(frames, timing)[:, None] * kernel_values(
+            self.kind, self.kernels, frames, timing
+        )
 
     @property
     def _unit(self) -> str:

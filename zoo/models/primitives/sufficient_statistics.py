@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from zoo.movement.kalman import PathNoise, Smoother
-from zoo.movement.rollout import Primitive, Timing, roll_out
+from zoo.models.primitives.kalman import PathNoise, Smoother
+from zoo.models.primitives.rollout import Primitive, roll_out
+from zoo.movement.timing import Movements, Timing
 
 __all__ = [
-    "Movements",
     "Sight",
     "Sums",
     "in_parts",
@@ -26,7 +26,6 @@ __all__ = [
     "sums_of",
 ]
 
-Movements = list[tuple[Tensor, Tensor]]
 COLUMNS = 500
 SEQUENCE, CHANNEL = (-4, -3, -2, -2, -2), (-3, -2, -1, -1, -1)
 
