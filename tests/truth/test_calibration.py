@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from sklearn.isotonic import IsotonicRegression
 from zoo.errors import FewGroupsWarning, NoDensityError, UnknownNameError
 from zoo.evaluation.answers import Answer
 from zoo.evaluation.calibration.conformal import Conformal
+from zoo.evaluation.calibration.odd import tempered
 from zoo.evaluation.calibration.pool import Pool
 from zoo.evaluation.calibration.promise import promised
 from zoo.evaluation.calibration.recalibration import (
@@ -345,3 +347,49 @@ def test_groups_of_many_and_of_few_entries_weigh_the_same() -> None:
     answer = Answer.of(items(scores, noise=torch.ones(1)), scores, None, groups)
     found = Pool.of(scores, answer).quantile(torch.tensor([0.4, 0.6], dtype=torch.float64))
     assert found.tolist() == [1.0, 5.0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_odd_group_of_three_does_not_blow_up_every_band(kind: str) -> None:
+    """Two walks like those to come and one three times as far off: 90 % bands, not 100 %.
+
+    The odd one counts as 1.5 times the median, so that its third of the weight may widen bands to
+    the 90 % quantile of ⅔ N(0, 1) + ⅓ N(0, 1.5²), 1.98, which holds 95 % of N(0, 1), beside the
+    doubt of three walks.
+    """
+    shares, plain = [], []
+    for seed in range(24):
+        calib, known = walks(3, 2 * seed)
+        raw, truth = walks(60, 2 * seed + 1)
+        odd = known.clone()
+        odd[seed % 3] *= 3
+        found = []
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FewGroupsWarning)
+            for told in (odd, known):
+                mended = raw.recalibrated(recalibrate(kind, calib, told))
+                found.append(float(covered(mended, truth, 0.9).mean()))
+        shares.append(found[0])
+        plain.append(found[1])
+    error = 3 * np.std(shares) / math.sqrt(24)
+    assert np.mean(plain) == pytest.approx(0.9, abs=0.03 + error)
+    assert 0.9 - error < np.mean(shares) < 0.95 + error
+
+
+def test_where_groups_can_promise_no_group_is_tempered() -> None:
+    """Nine groups: the guarantee counts the odd one as it is; of eight it is winsorised."""
+    raw, truth = walks(9, 5)
+    truth[2] *= 10
+    for count in (8, 9):
+        index = torch.arange(count)
+        answer = Answer.of(raw.rows(index), truth[index])
+        z = standardised(answer)
+        sizes = tempered(z, answer).abs().mean((1, 2))
+        if count == 9:
+            assert torch.equal(sizes, z.abs().mean((1, 2)))
+        else:
+            assert float(sizes[2]) == pytest.approx(1.5 * float(z.abs().mean((1, 2)).quantile(0.5)))
+            others = index != 2
+            assert bool((sizes <= z.abs().mean((1, 2)) + 1e-12).all())
+            expected = z.abs().mean((1, 2))[others].clamp(max=sizes[2])
+            torch.testing.assert_close(sizes[others], expected)

@@ -252,3 +252,27 @@ def test_the_latest_correction_of_a_question_is_kept() -> None:
     kinds = ("scale", "isotonic")
     found = [corrections(LastValue(), data, kind, setup=setup)[0] for kind in kinds]
     assert [p.correction.kind for p in Calibration().joined(found).parts] == ["isotonic"]
+
+
+def test_a_task_that_was_not_calibrated_says_that_its_bands_are_raw() -> None:
+    """Beside calibrated bands raw ones would be taken for such."""
+    data = of_person(movements(), "p" * 8)
+    run = zoo.fit(zoo.create("promp", data[:4]), data[:4])
+    before = run.reconstruct(data[4:]).interval(0.9)
+    run.calibrate(data[4:], tasks=["forecast"], method="scale")
+    with pytest.warns(OtherQuestionWarning, match="reconstruct: its bands are raw.*for forecast"):
+        after = run.reconstruct(data[4:])
+    assert after.recalibration is None and torch.equal(after.interval(0.9)[0], before[0])
+
+
+def test_too_few_frames_for_bands_that_follow_them_say_so() -> None:
+    data = of_person(movements(), "p" * 8)
+    run = zoo.fit(zoo.create("mean", data[:4]), data[:4])
+    setup = zoo.Setup(seen=4, horizon=10)
+    run.calibrate(data[4:], tasks=["forecast"], method="scale", setup=setup)
+    with (
+        pytest.warns(OtherQuestionWarning, match="bands are those of another question"),
+        pytest.warns(OtherQuestionWarning, match="too few frames are observed.*these are raw"),
+    ):
+        found = run.forecast(data.first(3), horizon=10)
+    assert found.recalibration is None

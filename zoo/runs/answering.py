@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,11 +13,12 @@ from numpy.typing import ArrayLike
 
 from zoo.arguments import whole_number
 from zoo.datasets.records import Pairs, Sequences, check_record
-from zoo.errors import NotCapableError
+from zoo.errors import NotCapableError, OtherQuestionWarning
 from zoo.evaluation.calibration.adapted import Adapted
 from zoo.evaluation.calibration.asked import Asked
 from zoo.evaluation.calibration.calibration import Calibrated, Calibration
 from zoo.evaluation.calibration.grid import Method, corrections, observed_difficulty
+from zoo.evaluation.calibration.promise import caller
 from zoo.evaluation.questions import Setup
 from zoo.prediction.prediction import Prediction, Recalibration
 from zoo.runs.units import check_unseen, fingerprints
@@ -193,6 +195,13 @@ class Answers(ABC):
         if not part.adaptive:
             return part.correction
         factor = observed_difficulty(self._bare(), query.data, draws=query.draws, seed=query.seed)
+        if factor is None:
+            warnings.warn(
+                f"{query.task}: too few frames are observed for bands that follow the errors in "
+                "them, as those calibrated do: these are raw",
+                OtherQuestionWarning,
+                stacklevel=caller(),
+            )
         return None if factor is None else Adapted(correction=part.correction, factor=factor)
 
     def _need(self, task: str) -> None:

@@ -14,6 +14,7 @@ from zoo.evaluation.answers import Groups
 from zoo.evaluation.calibration.asked import Asked
 from zoo.evaluation.calibration.promise import LEVEL, caller, promised
 from zoo.evaluation.calibration.recalibration import Stored, recalibration_from_state
+from zoo.evaluation.questions import NEEDS
 
 __all__ = ["PEOPLE", "Calibrated", "Calibration"]
 
@@ -130,6 +131,7 @@ class Calibration:
         """
         same = [part for part in self.parts if part.asked.task == asked.task]
         if not same:
+            _warn_of_raw(asked, self.tasks)
             return None
         near = _nearest(same, asked)
         if not (asked.like(near.asked) or _between(same, asked)):
@@ -155,6 +157,17 @@ class Calibration:
                 stacklevel=caller(),
             )
         return _interpolated(same, asked, near)
+
+
+def _warn_of_raw(asked: Asked, tasks: Sequence[str]) -> None:
+    """Say that bands are raw where others of the run are not, and these could be calibrated."""
+    if asked.task in NEEDS:
+        warnings.warn(
+            f"{asked}: its bands are raw, as the model gives them: calibrated for "
+            f"{', '.join(tasks)} only",
+            OtherQuestionWarning,
+            stacklevel=caller(),
+        )
 
 
 def _nearest(parts: list[Calibrated], asked: Asked) -> Calibrated:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from zoo.evaluation.answers import Answer
 from zoo.evaluation.calibration.curve import Curve
+from zoo.evaluation.calibration.odd import tempered
 from zoo.evaluation.calibration.pool import (
     LEVELS,
     Pool,
@@ -49,7 +50,7 @@ class Conformal:
     @classmethod
     def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
         """Factors from all groups, thresholds from scores of groups left out in turn."""
-        sizes = standardised(answer).abs()
+        sizes = tempered(standardised(answer), answer).abs()
         scores = sizes / crossed(sizes, answer, by, 1, common=False)
         pool = Pool.of(scores, answer)
         corrected = LEVELS * (1 + 1 / pool.independent)

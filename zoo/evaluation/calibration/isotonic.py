@@ -12,6 +12,7 @@ from torch import Tensor
 
 from zoo.evaluation.answers import Answer
 from zoo.evaluation.calibration.curve import Curve
+from zoo.evaluation.calibration.odd import tempered
 from zoo.evaluation.calibration.pool import (
     LEVELS,
     Pool,
@@ -44,8 +45,9 @@ class Isotonic:
     def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
         """Weighted quantiles of the PIT values' normal scores, on groups left out of the scale."""
         raw = answer.prediction
-        factors = crossed(standardised(answer).square(), answer, by, 2).to(raw.mean)
-        reduced = raw.mean + (answer.truth - raw.mean) / factors
+        z = tempered(standardised(answer), answer)
+        factors = crossed(z.square(), answer, by, 2)
+        reduced = raw.mean + (z / factors).to(raw.mean) * raw.std
         scores = torch.where(answer.mask, raw.normal_score(reduced).double(), 0.0)
         pool = Pool.of(scores, answer)
         return cls(

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 from torch import Tensor
 
 from zoo.evaluation.answers import Answer
+from zoo.evaluation.calibration.odd import tempered
 from zoo.evaluation.calibration.stretch import By, Stretch, standardised
 from zoo.prediction.prediction import Prediction
 from zoo.prediction.predictive import Predictive
@@ -31,7 +32,7 @@ class Scale:
     @classmethod
     def fit(cls, answer: Answer, by: tuple[By, ...]) -> Self:
         """Variance factors from the mean squared standardised residual."""
-        sizes = standardised(answer).square()
+        sizes = tempered(standardised(answer), answer).square()
         return cls(stretch=Stretch.fit(sizes, answer, by, 2), groups=answer.groups)
 
     def predictive(self, raw: Prediction) -> Predictive:
