@@ -16,6 +16,7 @@ from zoo.datasets.records.agreement import labels_of
 from zoo.datasets.records.checks import Groups, distinct_names, group_columns, rows_of, units_of
 from zoo.datasets.records.labelled import check_same_items, items
 from zoo.datasets.split import matching_rows, named_columns, split_rows
+from zoo.display import facts
 from zoo.types import Layout
 
 __all__ = ["Pairs"]
@@ -47,6 +48,17 @@ class Pairs:
             f"features, {len(self.channels)} targets in {units}, "
             f"groups {', '.join(self.groups) or 'none'}"
         )
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {
+            "items": len(self),
+            "features": self.features,
+            "targets": self.channels,
+            "units": tuple(dict.fromkeys(u or "no unit" for u in self.units)),
+            "groups": tuple(f"{k} ({len(set(v))})" for k, v in self.groups.items()),
+            "provenance": self.provenance,
+        }
+        return facts(f"Pairs {self.name!r}", rows)
 
     @classmethod
     def from_arrays(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -23,10 +23,15 @@ from zoo.datasets.records.checks import (
 )
 from zoo.datasets.records.controls import known_controls
 from zoo.datasets.records.labelled import movements
+from zoo.datasets.records.pictures import picture, shown
 from zoo.datasets.records.resample import resample_movements
 from zoo.datasets.records.windows import cut
 from zoo.datasets.split import matching_rows, named_columns, split_rows
 from zoo.types import Layout
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = ["Sequences"]
 
@@ -125,6 +130,18 @@ class Sequences:
             provenance=provenance,
             **known,
         )
+
+    def _repr_html_(self) -> str:
+        return shown(self)
+
+    def plot(
+        self, ax: Axes | None = None, *, channels: str | Sequence[str] | None = None
+    ) -> Figure:
+        """Every movement over time: the channels named, or the four that move most.
+
+        With ``ax`` one channel is drawn there. The figure is returned, to show or to save.
+        """
+        return picture(self, ax, channels)
 
     def __len__(self) -> int:
         """Number of movements."""

@@ -15,6 +15,7 @@ FLOORS = {
     "zoo.archive": 0,
     "zoo.version": 0,
     "zoo.arguments": 0,
+    "zoo.display": 0,
     "zoo.streams": 0,
     "zoo.prediction": 1,
     "zoo.datasets": 1,

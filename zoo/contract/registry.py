@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 
 from zoo.contract.methods import methods
 from zoo.contract.strategies import Inference
+from zoo.display import facts
 from zoo.errors import UnknownNameError
 
 __all__ = ["CAPABILITIES", "Entry", "Part", "Registry", "Scaling", "load", "named_well"]
@@ -78,6 +79,17 @@ class Entry:
             value = getattr(self, what)
             if value not in kinds:
                 raise ValueError(f"{self.name}: {what} is one of {', '.join(kinds)}; got {value!r}")
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {
+            "what it is": self.summary,
+            "from": self.thesis,
+            "guide": self.posterior,
+            "inference": type(self.inference).__name__,
+            "data": self.data,
+            "can": self.capabilities,
+        }
+        return facts(self.name, rows)
 
     @property
     def posterior(self) -> str:
@@ -163,6 +175,10 @@ class Registry:
         """Entries in the order of registration."""
         self._complete()
         return iter(self._entries.values())
+
+    def _repr_html_(self) -> str:
+        rows = {e.name: f"{e.summary}; can {', '.join(e.capabilities)}" for e in self}
+        return facts("Models", rows)
 
     def names(self, pattern: str = "*", *, can: str | None = None) -> list[str]:
         """Names that match a glob and, where ``can`` is given, have that capability."""

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import Literal, Protocol, Self
+from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
 
 from zoo.arguments import level_of, seed_of, whole_number
+from zoo.display import facts
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
-from zoo.prediction import mixtures
+from zoo.prediction import handing, mixtures
+from zoo.prediction.drawing import picks, with_noise
 from zoo.prediction.predictive import Predictive
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+    from matplotlib.axes import Axes as Panel
+    from matplotlib.figure import Figure
 
 __all__ = ["Prediction", "Recalibration"]
 
@@ -231,6 +240,40 @@ class Prediction:
         self._need_spread()
         return replace(self, recalibration=recalibration)
 
+    def to_pandas(self, level: float = 0.9) -> pandas.DataFrame:
+        """A row for every movement, time and channel: mean, std and the ends of the band.
+
+        A deterministic answer has a mean alone. Raises ModuleNotFoundError without pandas.
+        """
+        return handing.as_frame(self, level)
+
+    def to_xarray(self, level: float = 0.9) -> xarray.Dataset:
+        """The same over named axes, NaN after a movement's end, units as a coordinate."""
+        return handing.as_xarray(self, level)
+
+    def plot(
+        self,
+        ax: Panel | None = None,
+        *,
+        sequence: int = 0,
+        channels: str | Sequence[str] | None = None,
+    ) -> Figure:
+        """Mean with 50 % and 90 % bands of one movement: channels named, or those that move most.
+
+        With ``ax`` one channel is drawn there. The figure is returned, to show or to save.
+        """
+        return handing.picture(self, ax, sequence, channels)
+
+    def _repr_html_(self) -> str:
+        """Sizes, units and spread, for a notebook."""
+        rows: dict[str, object] = dict(zip(self.axes, self.shape, strict=True))
+        rows[f"{self.axes[-1]}s"] = self.names
+        rows["units"] = tuple(dict.fromkeys(self.units))
+        rows["spread"] = "yes" if self.has_spread else "none: the answer is deterministic"
+        raw = self.recalibration is None
+        rows["bands"] = "as the model gave them" if raw else "calibrated"
+        return facts(f"Prediction of {self.task}", rows)
+
     def _need_spread(self) -> None:
         if not self.has_spread:
             raise NoSpreadError(
@@ -258,16 +301,16 @@ class Prediction:
     def _paths(self, count: int, generator: torch.Generator) -> Tensor:
         p = self.predictive
         if p.draws is not None:
-            path = p.draws[_picks(count, p.draws, generator)]
+            path = p.draws[picks(count, p.draws, generator)]
             noise = None if p.noise is None else self.raw.aleatoric
-            return _with_noise(path, noise, generator)
+            return with_noise(path, noise, generator)
         if not p.joint or p.epistemic is not None:
             raise NoJointSamplesError(
                 "this prediction knows the marginals only; ask for sample(count, joint=False)"
             )
-        pick = _picks(count, p.location, generator)
+        pick = picks(count, p.location, generator)
         noise = None if p.noise is None else p.noise.expand_as(p.location)[pick]
-        return _with_noise(p.location[pick], noise, generator)
+        return with_noise(p.location[pick], noise, generator)
 
     def _marginals(self, count: int, generator: torch.Generator) -> Tensor:
         p = self.predictive
@@ -276,22 +319,4 @@ class Prediction:
         pick = torch.randint(like.shape[0], shape, generator=generator, device=like.device)
         scale = p.spread
         noise = None if scale is None else scale.expand_as(like).gather(0, pick)
-        return _with_noise(like.gather(0, pick), noise, generator)
-
-
-def _picks(count: int, paths: Tensor, generator: torch.Generator) -> Tensor:
-    """``count`` rows of ``paths``, none twice before each was drawn once."""
-    total = paths.shape[0]
-    rounds = [
-        torch.randperm(total, generator=generator, device=paths.device)
-        for _ in range(-(-count // total))
-    ]
-    return torch.cat(rounds)[:count]
-
-
-def _with_noise(path: Tensor, noise: Tensor | None, generator: torch.Generator) -> Tensor:
-    if noise is None:
-        return path
-    return path + noise * torch.randn(
-        path.shape, generator=generator, dtype=path.dtype, device=path.device
-    )
+        return with_noise(like.gather(0, pick), noise, generator)

@@ -20,6 +20,7 @@ from zoo.contract.registry import Entry, Part, Scaling, load
 from zoo.contract.settings import made
 from zoo.contract.strategies import Inference, Svi
 from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.display import facts
 from zoo.errors import UnknownNameError
 from zoo.inference.elbo import Program
 from zoo.streams import seeded
@@ -54,6 +55,20 @@ class Assembly:
             f"{self.parameters()} parameters, {type(self.inference).__name__}, "
             f"seed={self.seed}{given}"
         )
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {
+            "what it is": self.entry.summary,
+            "channels or targets": self.layout.channels,
+            "can": self.entry.capabilities,
+            "parameters": self.parameters(),
+            "guide": "none" if self.guide is None else type(self.guide).__name__,
+            "inference": type(self.inference).__name__,
+            "scaling": self.scaling,
+            "seed": self.seed,
+            "settings given": tuple(f"{k}={v!r}" for k, v in self.settings.items()),
+        }
+        return facts(f"{self.entry.name}, not trained yet", rows)
 
     @property
     def dtype(self) -> torch.dtype:

@@ -11,6 +11,7 @@ from pydantic import TypeAdapter
 
 from zoo import archive
 from zoo.datasets.records import Pairs, Sequences
+from zoo.display import facts
 from zoo.errors import DamagedRunError, NotCapableError
 from zoo.evaluation.calibration.calibration import Calibration
 from zoo.prediction.prediction import Prediction
@@ -65,6 +66,15 @@ class Ensemble(Answers):
         first = self.members[0].assembly.layout
         for run in self.members[1:]:
             first.check(run.assembly.layout)
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {
+            "members": [run.name for run in self.members],
+            "trained on": self.trained_on["name"],
+            "can": self.capabilities,
+            "calibrated for": self.calibration.tasks,
+        }
+        return facts(self.name.capitalize(), rows)
 
     @property
     def name(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -15,8 +15,10 @@ from torch import Tensor, nn
 from zoo.arguments import whole_number
 from zoo.contract.capabilities import Decodes, Encodes
 from zoo.datasets.records import Pairs, Sequences, check_record
+from zoo.display import facts
 from zoo.errors import NotCapableError
 from zoo.evaluation.calibration.calibration import Calibration
+from zoo.evaluation.figures.history import training
 from zoo.evaluation.questions import Setup
 from zoo.evaluation.scores import score
 from zoo.evaluation.table import Table
@@ -32,6 +34,10 @@ from zoo.runs.record import Record
 from zoo.runs.units import Ask, Exchange, check_unseen
 from zoo.streams import seeded
 from zoo.types import Wishes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = ["Run", "create", "evaluate", "load"]
 
@@ -52,6 +58,24 @@ class Run(Record, Answers):
     def name(self) -> str:
         """Name of the entry."""
         return self.assembly.entry.name
+
+    def _repr_html_(self) -> str:
+        rows: dict[str, object] = {
+            "trained on": self.trained_on["name"],
+            "channels": self.assembly.layout.channels,
+            "can": self.capabilities,
+            "calibrated for": self.calibration.tasks,
+            "parameters": self.assembly.parameters(),
+            "training": f"{self.seconds:.3g} s, {len(self.history)} rows of history",
+        }
+        return facts(f"Run of {self.name}", rows)
+
+    def plot_history(self, ax: Axes | None = None) -> Figure:
+        """The training's bound over the epochs, or its log evidence over the iterations.
+
+        Raises ValueError where the training was in closed form. The figure is returned.
+        """
+        return training(self.history, self.name, ax)
 
     @property
     def model(self) -> nn.Module:

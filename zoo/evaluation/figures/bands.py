@@ -13,6 +13,7 @@ from torch import Tensor
 
 from zoo.evaluation.answers import Answer, Groups
 from zoo.evaluation.reliability import Reliability
+from zoo.prediction.handing import band_panel
 from zoo.prediction.prediction import Prediction
 
 if TYPE_CHECKING:
@@ -177,16 +178,10 @@ def _bands(
     sequence: int,
     index: int,
 ) -> None:
-    at = (sequence, slice(0, _length(prediction, sequence)), index)
     frames = prediction.shape[1] if prediction.task == "forecast" else 0
     offset = start if frames else 0
     time = _time(prediction, offset)[: _length(prediction, sequence)]
-    if prediction.has_spread:
-        for level, alpha in ((0.9, 0.22), (0.5, 0.38)):
-            low, high = (end[at].tolist() for end in prediction.interval(level))
-            label = f"{round(100 * level)} % band"
-            axes.fill_between(time, low, high, color=COLOURS[0], alpha=alpha, lw=0, label=label)
-    axes.plot(time, prediction.mean[at].tolist(), color=COLOURS[0], linewidth=1.6, label="mean")
+    band_panel(axes, prediction, sequence, index, time)
     if whole is not None:
         rate = prediction.rate or 1.0
         when = [t / rate for t in range(len(whole))]
