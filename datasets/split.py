@@ -9,7 +9,7 @@ from numbers import Real
 
 import numpy as np
 
-from zoo.arguments import seed_of
+from zoo.arguments import list_of, seed_of
 from zoo.errors import UnknownNameError
 
 __all__ = ["matching_rows", "named_columns", "nearest", "split_rows"]
@@ -73,8 +73,11 @@ def named_columns(names: Sequence[str], wanted: Sequence[str], what: str) -> lis
     """
     if isinstance(wanted, str):
         raise TypeError(f"{what} names must come as a list; got the string {wanted!r}")
+    wanted = list_of(wanted, f"{what} names")
     if not wanted:
         raise ValueError(f"at least one {what} name is needed")
+    if any(not isinstance(name, str) for name in wanted):
+        raise TypeError(f"{what} names must be text; got {wanted}")
     if len(set(wanted)) != len(wanted):
         raise ValueError(f"{what} names must be distinct; got {list(wanted)}")
     for name in wanted:

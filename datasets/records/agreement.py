@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from zoo.arguments import names_of
 from zoo.datasets.records.arrays import matrix
 from zoo.datasets.records.clock import common_rate
 from zoo.datasets.records.columns import Part
@@ -39,6 +40,7 @@ def agreed(
     if any((p.names is None) != (first.names is None) for p in parts):
         named = next(p.what for p in parts if p.names is not None)
         raise ValueError(f"all movements or none must have names of channels; {named} has them")
+    channels = None if channels is None else names_of(channels, "channel names")
     names = first.names if channels is None or first.names is None else tuple(channels)
     places = [_places(p, names, "channels" if channels else first.what) for p in parts]
     told = [
@@ -119,6 +121,11 @@ def _group_columns(
     found = {key: tuple(p.groups[key] for p in parts) for key in first}
     if groups is None:
         return found or None
+    if not isinstance(groups, Mapping):
+        raise TypeError(
+            "groups must be a mapping of names to columns, such as {'subject': ['a', 'b']}; got "
+            f"{groups!r:.60}"
+        )
     for key in groups:
         if key in found and tuple(str(v) for v in groups[key]) != found[key]:
             raise ValueError(f"group column {key!r} is given and in the data, with other values")

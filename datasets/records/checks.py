@@ -9,6 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from zoo.arguments import list_of
+
 __all__ = [
     "Groups",
     "distinct_names",
@@ -40,6 +42,7 @@ def distinct_names(names: Sequence[str] | None, count: int, what: str) -> tuple[
         return tuple(f"{what}_{i}" for i in range(count))
     if isinstance(names, str):
         raise TypeError(f"{what} names must come as a list; got the string {names!r}")
+    names = list_of(names, f"{what} names")
     if any(not isinstance(n, str) for n in names):
         raise TypeError(f"{what} names must be text; got {list(names)}")
     if len(names) != count or len(set(names)) != count:
@@ -51,6 +54,9 @@ def units_of(units: str | Sequence[str], count: int) -> tuple[str, ...]:
     """One unit for each name."""
     if isinstance(units, str):
         return (units,) * count
+    units = list_of(units, "units")
+    if any(not isinstance(u, str) for u in units):
+        raise TypeError(f"units must be text; got {units}")
     if len(units) != count:
         raise ValueError(f"{count} units are needed; got {list(units)}")
     return tuple(units)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from zoo.arguments import list_of
 from zoo.datasets.records.checks import Groups
 from zoo.datasets.records.pairs import Pairs
 from zoo.datasets.records.sequences import Sequences
@@ -43,8 +44,12 @@ def concatenate(records: Sequence[_Record]) -> _Record:
     >>> both.lengths.tolist(), both.values.shape
     ([5, 5, 7, 7], torch.Size([4, 7, 1]))
     """
-    if isinstance(records, Pairs | Sequences) or not len(records):
-        raise ValueError("concatenate takes a list of at least one record")
+    listed = () if isinstance(records, Pairs | Sequences) else list_of(records, "records")
+    if not listed or any(not isinstance(r, Pairs | Sequences) for r in listed):
+        raise ValueError(
+            "concatenate takes a list of at least one record, of Sequences or Pairs; got "
+            f"{records!r:.60}"
+        )
     first = records[0]
     for i, record in enumerate(records[1:], 1):
         _check(first, record, i)

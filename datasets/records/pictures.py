@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
+from zoo.arguments import names_of
 from zoo.datasets.split import named_columns
 from zoo.display import BLUE, clean, facts, panels
 
@@ -85,7 +86,7 @@ def shown(data: Movements) -> str:
 def _chosen(data: Movements, channels: str | Sequence[str] | None, most: int) -> list[int]:
     """The channels named, else those that move most beside their own unit."""
     if channels is not None:
-        names = [channels] if isinstance(channels, str) else list(channels)
+        names = [channels] if isinstance(channels, str) else names_of(channels, "channels")
         if not names:
             raise ValueError(f"channels must name at least one of {', '.join(data.channels)}")
         return named_columns(data.channels, names, "channel")

@@ -131,8 +131,8 @@ def test_goal_duration_and_switch_combine_and_repeat(name: str) -> None:
         ({"start": 5}, "name the movements"),
         ({"onto": [0, 1], "steps": 3}, "onto has 2 movements; 1 or 3"),
         ({"onto": [0], "start": 20, "steps": 10}, "does not fit in 24 frames"),
-        ({"onto": [0], "start": -1}, "does not fit"),
-        ({"onto": [0], "steps": 0}, "does not fit"),
+        ({"onto": [0], "start": -1}, "start must be at least 0"),
+        ({"onto": [0], "steps": 0}, "steps must be at least 1"),
     ],
 )
 def test_impossible_wishes_are_named(name: str, wishes: dict[str, Any], message: str) -> None:

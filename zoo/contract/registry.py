@@ -182,7 +182,9 @@ class Registry:
 
     def names(self, pattern: str = "*", *, can: str | None = None) -> list[str]:
         """Names that match a glob and, where ``can`` is given, have that capability."""
-        if can is not None and can not in CAPABILITIES:
+        if not isinstance(pattern, str):
+            raise TypeError(f"a pattern of names is text, such as '*dmp*'; got {pattern!r}")
+        if can is not None and not (isinstance(can, str) and can in CAPABILITIES):
             raise UnknownNameError(f"no capability {can!r}; there are {', '.join(CAPABILITIES)}")
         return [
             e.name

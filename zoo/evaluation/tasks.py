@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from zoo.arguments import list_of
 from zoo.datasets.records import Groups, Pairs, Sequences
 from zoo.errors import UnanswerableError, UnknownNameError
 from zoo.evaluation.questions import NEEDS, Question, Setup, ask
@@ -116,7 +117,9 @@ def posed(
     """
     found: list[Outcome] = []
     refused: dict[str, UnanswerableError] = {}
-    how = setup or Setup()
+    how = Setup() if setup is None else setup
+    if not isinstance(how, Setup):
+        raise TypeError(f"setup must be a zoo.Setup; got {type(how).__name__}")
     for name in tasks_of(run, tasks):
         try:
             found.append(_outcome(run, ask(name, data, how), how))
@@ -131,12 +134,12 @@ def tasks_of(run: Predictor, tasks: Sequence[str] | None = None) -> list[str]:
     """Tasks to pose: those named, all of which the model must have, or all that it has."""
     names = [task for task, need in NEEDS.items() if need in run.capabilities]
     if tasks is not None:
-        unknown = [t for t in tasks if t not in names]
-        if unknown:
-            raise UnknownNameError(
-                f"no task {unknown[0]!r} for this model; it has {', '.join(names)}"
-            )
-        names = list(tasks)
+        wanted = list_of(tasks, "tasks")
+        unknown = [t for t in wanted if not isinstance(t, str) or t not in names]
+        if unknown or not wanted:
+            problem = f"no task {unknown[0]!r} for this model" if unknown else "tasks names none"
+            raise UnknownNameError(f"{problem}; it has {', '.join(names)}")
+        names = wanted
     return names
 
 

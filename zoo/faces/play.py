@@ -164,6 +164,8 @@ def _track(
 
 
 def _channels(shown: Sequences | Prediction) -> tuple[str, ...]:
+    if not isinstance(shown, Sequences | Prediction):
+        raise TypeError(f"play shows Sequences and Predictions; got {type(shown).__name__}")
     return shown.channels if isinstance(shown, Sequences) else shown.names
 
 

@@ -1,11 +1,36 @@
-"""Draws of a prediction: which paths, and their noise."""
+"""Parts of a prediction: which rows, which draws of paths, and their noise."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-__all__ = ["picks", "with_noise"]
+__all__ = ["picks", "rows_among", "tensor_of", "with_noise"]
+
+
+def tensor_of(value: object, what: str) -> Tensor:
+    """Numbers as a tensor; what holds none is refused by name."""
+    try:
+        found = torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError):
+        found = None
+    if found is None or found.is_complex():
+        raise TypeError(f"{what} must be a tensor of numbers; got {type(value).__name__}")
+    return found
+
+
+def rows_among(index: object, count: int, what: str) -> Tensor:
+    """Numbers of rows, from a truth value for each of ``count`` or from their numbers."""
+    found = tensor_of(index, f"the index of {what}")
+    if found.dtype == torch.bool and found.shape == (count,):
+        return found.nonzero()[:, 0]
+    if found.ndim != 1 or found.dtype == torch.bool or found.is_floating_point():
+        raise TypeError(
+            f"{what} are chosen by a list of numbers or by {count} truth values; got {index!r}"
+        )
+    if len(found) and not (-count <= int(found.min()) and int(found.max()) < count):
+        raise IndexError(f"there are {count} {what}; got {found.tolist()}")
+    return found.long()
 
 
 def picks(count: int, paths: Tensor, generator: torch.Generator) -> Tensor:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor
 
-from zoo.arguments import level_of, whole_number
+from zoo.arguments import level_of, names_of, whole_number
 from zoo.display import BLUE, clean, panels, partner
 
 if TYPE_CHECKING:
@@ -103,6 +103,7 @@ def picture(
 ) -> Figure:
     """Mean with 50 % and 90 % bands of one movement, a panel a channel; of items over their row."""
     named = [channels] if isinstance(channels, str) else channels
+    named = None if named is None else names_of(named, "channels")
     indices = _chosen(prediction, named, sequence, 1 if ax is not None else MOST)
     figure, axes = panels(ax, len(indices))
     for panel, index in zip(axes, indices, strict=True):

@@ -16,7 +16,7 @@ from zoo.arguments import level_of, seed_of, whole_number
 from zoo.display import facts
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
 from zoo.prediction import handing, mixtures
-from zoo.prediction.drawing import picks, with_noise
+from zoo.prediction.drawing import picks, rows_among, tensor_of, with_noise
 from zoo.prediction.predictive import Predictive
 
 if TYPE_CHECKING:
@@ -219,15 +219,15 @@ class Prediction:
 
     def channel(self, name: str) -> int:
         """Index of a channel or target by name."""
-        if name not in self.names:
+        if not isinstance(name, str) or name not in self.names:
             raise ValueError(
                 f"no {self.axes[-1]} {name!r}; there are {', '.join(self.names[:8])}, …"
             )
         return self.names.index(name)
 
-    def rows(self, index: Tensor) -> Self:
+    def rows(self, index: Tensor | Sequence[int]) -> Self:
         """The prediction of some sequences or items, by their numbers or by a boolean each."""
-        where = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        where = rows_among(index, self.shape[0], f"{self.axes[0]}s of a prediction")
         return replace(
             self,
             predictive=self.predictive.rows(where),
@@ -290,6 +290,7 @@ class Prediction:
         return mixture
 
     def _expand(self, value: Tensor) -> Tensor:
+        value = tensor_of(value, "value")
         leading = value.shape[:1] if value.ndim == len(self.shape) + 1 else ()
         try:
             return value.to(self.predictive.location).expand(*leading, *self.shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from typing import Any, Literal, Self
 
 from numpy.typing import ArrayLike
 
-from zoo.arguments import whole_number
+from zoo.arguments import positive, whole_number
 from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.errors import NotCapableError, OtherQuestionWarning
 from zoo.evaluation.calibration.adapted import Adapted
@@ -126,6 +125,8 @@ class Answers(ABC):
         """
         self._need("generate")
         check_record(like, "generate")
+        duration = positive(duration, "duration")
+        start, steps = whole_number(start, "start", 0), whole_number(steps, "steps")
         _check_timing(like, duration, onto is not None, start, steps)
         return self._answer(
             Query(
@@ -212,8 +213,6 @@ class Answers(ABC):
 
 def _check_timing(like: Sequences, duration: float, switches: bool, start: int, steps: int) -> None:
     """Refuse a duration without frames, and a switch outside the new movement."""
-    if not 0 < duration < math.inf:
-        raise ValueError(f"duration must be positive and finite; got {duration}")
     shortest = int(like.lengths.min())
     frames = round((shortest - 1) * duration) + 1
     if frames < 3:
@@ -222,7 +221,7 @@ def _check_timing(like: Sequences, duration: float, switches: bool, start: int, 
         )
     if not switches and (start, steps) != (0, 1):
         raise ValueError("start and steps are those of a switch: name the movements to go onto")
-    if switches and not (start >= 0 and steps >= 1 and start + steps <= frames):
+    if switches and start + steps > frames:
         raise ValueError(
             f"switching from frame {start} over {steps} frames does not fit in {frames} frames"
         )

@@ -7,7 +7,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, get_args, get_type_hints
+from typing import Any, cast, get_args, get_type_hints
 
 import pyro
 import torch
@@ -215,10 +215,9 @@ def _part(entry: Entry, part: Part, *needed: str) -> Any:
 
 
 def _scaling(kind: Any) -> Scaling:
-    if kind not in get_args(Scaling):
+    if not isinstance(kind, str) or kind not in get_args(Scaling):
         raise ValueError(f"scaling is one of {', '.join(get_args(Scaling))}; got {kind!r}")
-    scaling: Scaling = kind
-    return scaling
+    return cast(Scaling, kind)
 
 
 def _config(entry: Entry, kind: type, values: Mapping[str, Any]) -> Any:
@@ -240,6 +239,8 @@ def _strategy(entry: Entry, values: Mapping[str, Any]) -> Inference:
 
 
 def _usable(device: str) -> str:
+    if not isinstance(device, str | torch.device):
+        raise TypeError(f"device must be text, such as 'cpu' or 'cuda'; got {device!r}")
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:

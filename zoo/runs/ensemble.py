@@ -10,6 +10,7 @@ from typing import Any, NoReturn, Self
 from pydantic import TypeAdapter
 
 from zoo import archive
+from zoo.arguments import list_of
 from zoo.datasets.records import Pairs, Sequences
 from zoo.display import facts
 from zoo.errors import DamagedRunError, NotCapableError
@@ -61,8 +62,11 @@ class Ensemble(Answers):
 
     def __post_init__(self) -> None:
         """Refuse an empty ensemble, and members of different channels, units or rates."""
-        if not self.members:
+        members = list_of(self.members, "members")
+        if not members:
             raise ValueError("an ensemble needs at least 1 member; got none")
+        if alien := [m for m in members if not isinstance(m, Run)]:
+            raise TypeError(f"members must be runs; got {type(alien[0]).__name__}")
         first = self.members[0].assembly.layout
         for run in self.members[1:]:
             first.check(run.assembly.layout)
@@ -186,6 +190,6 @@ def fit_ensemble(
                 overwrite=overwrite,
                 progress=progress,
             )
-            for i, assembly in enumerate(assemblies)
+            for i, assembly in enumerate(list_of(assemblies, "assemblies"))
         )
     )

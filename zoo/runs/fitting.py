@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from zoo.arguments import path_of
 from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.evaluation.calibration.calibration import Calibration
 from zoo.inference.harness import Session
@@ -61,7 +62,8 @@ def fit(
     )
     if run_dir is None:
         return _fitted(assembly, train, val, session, {})
-    folder, made_of = Path(run_dir), fingerprint(assembly, train, val)
+    folder = path_of(run_dir, "run_dir must be a folder:")
+    made_of = fingerprint(assembly, train, val)
     with claimed(folder, made_of, resume, overwrite) as finished:
         if finished:
             return _kept(assembly, folder, progress)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from zoo.arguments import whole_number
+from zoo.arguments import path_of, whole_number
 from zoo.contract.capabilities import Decodes, Encodes
 from zoo.datasets.records import Pairs, Sequences, check_record
 from zoo.display import facts
@@ -191,8 +191,9 @@ class Run(Record, Answers):
         Another run there is replaced only with ``overwrite``, else RunExistsError is raised; the
         same training with a newer calibration always is.
         """
-        with free(Path(folder)):
-            return save_run(self, Path(folder), overwrite=overwrite)
+        place = path_of(folder, "save needs a folder:")
+        with free(place):
+            return save_run(self, place, overwrite=overwrite)
 
     def _bare(self) -> Run:
         return replace(self, calibration=Calibration(), calibrated_on=[])
@@ -280,4 +281,5 @@ def evaluate(
 
 def load(folder: str | Path, *, device: str = "cpu") -> Run:
     """A run that :meth:`Run.save` wrote; a damaged or foreign folder is refused with its reason."""
-    return Run(**vars(load_run(Path(folder), device=device)))
+    place = path_of(folder, "load takes the folder that a run was saved in:")
+    return Run(**vars(load_run(place, device=device)))

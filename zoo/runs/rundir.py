@@ -32,7 +32,7 @@ def claimed(
     RunLockedError where another process trains there, and FileNotFoundError where
     ``resume="must"`` finds nothing.
     """
-    if resume not in get_args(Resume):
+    if not isinstance(resume, str) or resume not in get_args(Resume):
         raise ValueError(f"resume must be 'never', 'auto' or 'must'; got {resume!r}")
     if overwrite and resume != "never":
         raise ValueError(

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from zoo.contract.capabilities import FollowsPhase, Reaches, Reports
 from zoo.datasets.records import Pairs, Sequences
+from zoo.datasets.records.arrays import doubles
 from zoo.datasets.records.scaling import Scaler
 from zoo.errors import ExtrapolationWarning, WindowsWarning
 from zoo.inference.loader import whole
@@ -102,7 +103,7 @@ class Exchange:
         """A last frame to reach, for each of ``count`` movements, in the model's scale."""
         layout = self.assembly.layout
         width = len(layout.channels)
-        array = np.asarray(goal, dtype=np.float64)
+        array = doubles(goal, "goal")
         if array.shape not in ((width,), (count, width)):
             raise ValueError(
                 f"goal has shape {array.shape}; ({width},) or ({count}, {width}) is needed, "
@@ -159,7 +160,7 @@ class Exchange:
         if isinstance(data, Sequences):
             raise TypeError(f"{self.assembly.entry.name} predicts Pairs; got Sequences")
         layout = self.assembly.layout
-        inputs = np.asarray(data, dtype=np.float64)
+        inputs = doubles(data, "inputs")
         if inputs.ndim != 2 or inputs.shape[1] != len(layout.inputs):
             raise ValueError(
                 f"inputs have shape {inputs.shape}; (item, {len(layout.inputs)}) is needed"

@@ -55,6 +55,8 @@ def corrections(
     of lengths. A task without an answer on these data stays as it is, with a NotCalibratedWarning.
     Where all have none the first one's UnanswerableError is raised.
     """
+    if setup is not None and not isinstance(setup, Setup):
+        raise TypeError(f"setup must be a zoo.Setup; got {type(setup).__name__}")
     found: list[Calibrated] = []
     refused: dict[str, UnanswerableError] = {}
     names = tasks_of(run, tasks)
