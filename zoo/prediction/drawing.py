@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["picks", "rows_among", "tensor_of", "with_noise"]
+from zoo.prediction.predictive import Predictive
+
+__all__ = ["marginals", "picks", "rows_among", "tensor_of", "with_noise"]
 
 
 def tensor_of(value: object, what: str) -> Tensor:
@@ -50,3 +52,13 @@ def with_noise(path: Tensor, noise: Tensor | None, generator: torch.Generator) -
     return path + noise * torch.randn(
         path.shape, generator=generator, dtype=path.dtype, device=path.device
     )
+
+
+def marginals(p: Predictive, count: int, generator: torch.Generator) -> Tensor:
+    """Draws of every entry by itself."""
+    like = p.location
+    shape = (count, *like.shape[1:])
+    pick = torch.randint(like.shape[0], shape, generator=generator, device=like.device)
+    scale = p.spread
+    noise = None if scale is None else scale.expand_as(like).gather(0, pick)
+    return with_noise(like.gather(0, pick), noise, generator)

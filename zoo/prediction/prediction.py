@@ -16,7 +16,7 @@ from zoo.arguments import level_of, seed_of, whole_number
 from zoo.display import facts
 from zoo.errors import NoDensityError, NoJointSamplesError, NoSpreadError
 from zoo.prediction import handing, mixtures
-from zoo.prediction.drawing import picks, rows_among, tensor_of, with_noise
+from zoo.prediction.drawing import marginals, picks, rows_among, tensor_of, with_noise
 from zoo.prediction.predictive import Predictive
 
 if TYPE_CHECKING:
@@ -212,7 +212,9 @@ class Prediction:
         self._need_spread()
         count = whole_number(count, "count")
         generator = torch.Generator(device=self.mean.device).manual_seed(seed_of(seed))
-        draws = self._paths(count, generator) if joint else self._marginals(count, generator)
+        draws = (
+            self._paths(count, generator) if joint else marginals(self.predictive, count, generator)
+        )
         if self.recalibration is None:
             return draws
         return self.recalibration.transport(self.raw, draws)
@@ -312,12 +314,3 @@ class Prediction:
         pick = picks(count, p.location, generator)
         noise = None if p.noise is None else p.noise.expand_as(p.location)[pick]
         return with_noise(p.location[pick], noise, generator)
-
-    def _marginals(self, count: int, generator: torch.Generator) -> Tensor:
-        p = self.predictive
-        like = p.location
-        shape = (count, *self.shape)
-        pick = torch.randint(like.shape[0], shape, generator=generator, device=like.device)
-        scale = p.spread
-        noise = None if scale is None else scale.expand_as(like).gather(0, pick)
-        return with_noise(like.gather(0, pick), noise, generator)
