@@ -122,7 +122,8 @@ class Result:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The tables for a terminal, in parts where it is narrow, and the findings."""
         yield Markdown(f"# {self.identifier}: {self.title}\n\nData: {self.source}.")
-        for part in (self, *self.sections):
+        parts: list[Result | Section] = [self, *self.sections]
+        for part in parts:
             yield from blocks(
                 part.title if part is not self else "",
                 part.columns,
