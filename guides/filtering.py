@@ -7,12 +7,13 @@ from typing import ClassVar, Literal, Protocol
 import pyro
 import pyro.distributions as dist
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.contract.settings import Count, Positive, settings
 from zoo.guides.recurrence import FilteringNoise, NoiseNetwork, Stacked
+from zoo.movement.durations import stretched
 from zoo.movement.plan import Plan
 from zoo.nn.mlp import trunk
 from zoo.nn.moments import GaussianHead
@@ -31,17 +32,23 @@ class LatentDynamics(Protocol):
     kernels: int
     goal_scaling: bool
 
-    @property
-    def transition(self) -> Float[Tensor, "state state"]:
-        """A of (76), for row vectors."""
+    def lengths(self, batch: Batch) -> Int[Tensor, " sequence"] | None:
+        """Frames of every movement; None where all have as many as the model was made for."""
         ...
 
-    def noise_gain(self) -> Float[Tensor, "latent state"]:
+    def transition(self, batch: Batch) -> Float[Tensor, "*window state state"]:
+        """A of (76), for row vectors: shared, or of every window."""
+        ...
+
+    def noise_gain(self, batch: Batch) -> Float[Tensor, "*window latent state"]:
         """G: how the noise ε̂ enters the next state, (77)."""
         ...
 
     def initial_state(
-        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
+        self,
+        z: Float[Tensor, "window latent"],
+        velocity: Float[Tensor, "window latent"],
+        batch: Batch,
     ) -> Float[Tensor, "window state"]:
         """State of a window's first frame."""
         ...
@@ -67,8 +74,9 @@ class FilteringGuide(nn.Module):
 
     q(z_t | x_t) encodes every frame (80), the first as the window's initial state and a movement's
     last as its goal (78); the velocity is encoded from the first two frames (§6.2.1.4, m = 2);
-    w = g_2(g_1(x_1), …, g_1(x_n)) (88); ε̂ is recognised from (x_{t+1}, z_t) (79). What belongs to
-    a movement is computed once, however many of its windows a batch holds.
+    w = g_2(g_1(x_1), …, g_1(x_n)) (88), with g_1 at n equal phases of movements that last longer or
+    shorter than n frames; ε̂ is recognised from (x_{t+1}, z_t) (79). What belongs to a movement is
+    computed once, however many of its windows a batch holds.
     """
 
     config_class: ClassVar[type] = Config
@@ -106,20 +114,20 @@ class FilteringGuide(nn.Module):
                 FilteringNoise(
                     self.noise,
                     features,
-                    model.initial_state(*begin),
+                    model.initial_state(z_1, v, batch),
                     model.drive(each, batch),
-                    model.transition,
-                    model.noise_gain(),
+                    model.transition(batch),
+                    model.noise_gain(batch),
                 )
-                for *begin, each in zip(first, speed, plan.draws(), strict=True)
+                for z_1, v, each in zip(first, speed, plan.draws(), strict=True)
             ]
             pyro.sample("epsilon", parts[0] if z.ndim == 3 else Stacked(parts, z.shape[:-3]))
 
     def plan(self, batch: Batch) -> Plan:
         """What is recognised of whole movements."""
-        x = batch.movements
-        w = pyro.sample("w", self.weights(x))
-        goal = pyro.sample("goal", normal(self._encode(x[:, -1]), 1))
+        x, lengths = batch.movements, self._dynamics.lengths(batch)
+        w = pyro.sample("w", self.weights(x, lengths))
+        goal = pyro.sample("goal", normal(self._encode(_last(x, lengths)), 1))
         start = None
         if self._dynamics.goal_scaling:
             start = pyro.sample("start", normal(self._encode(x[:, 0]), 1))
@@ -130,9 +138,13 @@ class FilteringGuide(nn.Module):
         """Number of places of a movement whose features make w."""
         return self._dynamics.frames
 
-    def weights(self, movements: Float[Tensor, "sequence frame channel"]) -> TorchDistribution:
-        """q(w | x_{1:n}) of (88)."""
-        return self.forcing(self.g_1(movements))
+    def weights(
+        self,
+        movements: Float[Tensor, "sequence frame channel"],
+        lengths: Int[Tensor, " sequence"] | None = None,
+    ) -> TorchDistribution:
+        """q(w | x_{1:n}) of (88), of features at equal phases where movements differ in length."""
+        return self.forcing(stretched(self.g_1(movements), lengths, self.places))
 
     def forcing(self, features: Float[Tensor, "sequence place feature"]) -> TorchDistribution:
         """q(w) of features g_1: MLP_w and, for a Gaussian, its standard deviations."""
@@ -166,6 +178,14 @@ class FilteringGuide(nn.Module):
     def _velocity(self, h: Float[Tensor, "window time hidden"]) -> tuple[Tensor, Tensor]:
         moments: tuple[Tensor, Tensor] = self.velocity(h[:, :2].flatten(1))
         return moments
+
+
+def _last(
+    movements: Float[Tensor, "sequence frame channel"], lengths: Int[Tensor, " sequence"] | None
+) -> Float[Tensor, "sequence channel"]:
+    if lengths is None:
+        return movements[:, -1]
+    return movements[torch.arange(len(movements), device=movements.device), lengths - 1]
 
 
 def _head(inputs: int, outputs: int, std: float) -> GaussianHead:

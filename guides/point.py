@@ -24,7 +24,10 @@ class Imitated(Protocol):
     latent_dim: int
 
     def imitate(
-        self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None
+        self,
+        path: Float[Tensor, "window time latent"],
+        seen: Bool[Tensor, "window time"] | None,
+        batch: Batch | None = None,
     ) -> Float[Tensor, "window parameter latent"]:
         """Parameters whose roll-out is nearest to a path where it was seen."""
         ...
@@ -109,7 +112,7 @@ class PointGuide(nn.Module):
         seen = None if batch.mask is None else batch.mask.any(-1)
         with pyro.plate("windows", size=batch.total, subsample=torch.arange(len(batch))):
             pyro.sample("y", dist.Delta(y).to_event(2))
-            pyro.sample("theta", dist.Delta(model.imitate(y, seen)).to_event(2))
+            pyro.sample("theta", dist.Delta(model.imitate(y, seen, batch)).to_event(2))
 
     def encode(
         self,

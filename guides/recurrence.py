@@ -72,13 +72,15 @@ class _Filter(torch.autograd.Function):
         m = noise.new_empty(*noise.shape[:2], 2 * latent)
         s[0] = state
         lift, head = _lift(state_weight, state.shape[1]).t(), weight.t()
-        least = noise.new_full((), floor)
+        least, own = noise.new_full((), floor), transition.ndim == 3
         for t in range(steps):
             torch.addmm(features[t], s[t], lift, out=h[t]).clamp_min_(0)
             μ, root = torch.addmm(bias, h[t], head, out=m[t]).split(latent, 1)
             torch.addcmul(least, root, root, out=σ[t])
             torch.addcmul(μ, σ[t], noise[t], out=ε[t])
-            if t + 1 < steps:
+            if t + 1 < steps and own:
+                s[t + 1] = drive[t] + _rows(s[t], transition) + _rows(ε[t], gain)
+            elif t + 1 < steps:
                 torch.addmm(drive[t], s[t], transition, out=s[t + 1]).addmm_(ε[t], gain)
         ctx.save_for_backward(s, h, m, ε, noise, transition, gain, state_weight, weight)
         return ε, σ
@@ -91,18 +93,23 @@ class _Filter(torch.autograd.Function):
         steps, latent = noise.shape[0], noise.shape[2]
         root2 = 2 * m[..., latent:]
         slope, direct = root2 * noise, root2 * g_σ
-        lift, back, out = _lift(state_weight, s.shape[2]), transition.t(), gain.t()
+        lift, back, out = _lift(state_weight, s.shape[2]), transition.mT, gain.mT
+        own = transition.ndim == 3
         λ, g_h, g_m = torch.zeros_like(s), h.sign(), torch.empty_like(m)
         g_state = torch.zeros_like(s[0])
         for t in range(steps - 1, -1, -1):
             μ, root = g_m[t].split(latent, 1)
-            μ.copy_(torch.addmm(g_ε[t], λ[t], out))
+            μ.copy_(g_ε[t] + _rows(λ[t], out) if own else torch.addmm(g_ε[t], λ[t], out))
             torch.addcmul(direct[t], μ, slope[t], out=root)
             g_h[t].mul_(g_m[t] @ weight)
             before = λ[t - 1] if t else g_state
-            torch.mm(λ[t], back, out=before).addmm_(g_h[t], lift)
-        g_transition = _contract(s, λ) if ctx.needs_input_grad[4] else None
-        g_lift = _contract(g_h, s)[:, :latent]
+            if own:
+                before.copy_(_rows(λ[t], back))
+            else:
+                torch.mm(λ[t], back, out=before)
+            before.addmm_(g_h[t], lift)
+        g_transition = _contract(s, λ, own) if ctx.needs_input_grad[4] else None
+        g_lift = _contract(g_h, s, False)[:, :latent]
         g_bias = g_m.flatten(0, 1).sum(0)
         return (
             g_h,
@@ -110,9 +117,9 @@ class _Filter(torch.autograd.Function):
             g_state,
             λ,
             g_transition,
-            _contract(ε, λ),
+            _contract(ε, λ, own),
             g_lift,
-            _contract(g_m, h),
+            _contract(g_m, h, False),
             g_bias,
             None,
         )
@@ -123,7 +130,14 @@ def _lift(weight: Tensor, states: int) -> Tensor:
     return nn.functional.pad(weight, (0, states - weight.shape[1]))
 
 
-def _contract(left: Tensor, right: Tensor) -> Tensor:
+def _rows(rows: Tensor, matrices: Tensor) -> Tensor:
+    """Every row times the matrix of its own window."""
+    return torch.bmm(rows[:, None], matrices)[:, 0]
+
+
+def _contract(left: Tensor, right: Tensor, own: bool) -> Tensor:
+    if own:
+        return torch.einsum("twi,twj->wij", left, right)
     return left.flatten(0, 1).t() @ right.flatten(0, 1)
 
 
@@ -238,7 +252,7 @@ class FilteringNoise(RecurrentNoise):
     r"""q(ε̂_{2:T} | x, s_1): ε̂_{t+1} ~ N(μ(x_{t+1}, z_t), σ²(x_{t+1}, z_t)), (79), (84).
 
     The states between follow s_{t+1} = s_t A + drive_t + ε̂_{t+1} G, in plain torch with the
-    adjoint written out.
+    adjoint written out. A and G are shared by all windows, or each has its own.
     """
 
     def __init__(
@@ -247,13 +261,13 @@ class FilteringNoise(RecurrentNoise):
         features: Float[Tensor, "step window hidden"],
         state: Float[Tensor, "window state"],
         drive: Float[Tensor, "step window state"],
-        transition: Float[Tensor, "state state"],
-        gain: Float[Tensor, "latent state"],
+        transition: Float[Tensor, "*each state state"],
+        gain: Float[Tensor, "*each latent state"],
     ) -> None:
         """Noise of ``window`` sub-sequences, each ``step`` + 1 frames long."""
         self.network, self.features, self.state = network, features, state
         self.drive, self.transition, self.gain = drive, transition, gain
-        super().__init__(features.shape[0], state.shape[0], gain.shape[0], state)
+        super().__init__(features.shape[0], state.shape[0], gain.shape[-2], state)
 
     def draw(self, η: Float[Tensor, "step window latent"]) -> tuple[Tensor, Tensor]:
         """The recurrence and its adjoint."""
@@ -276,11 +290,13 @@ class FilteringNoise(RecurrentNoise):
         self, value: Float[Tensor, "window step latent"]
     ) -> tuple[Float[Tensor, "step window latent"], Float[Tensor, "step window latent"]]:
         """Mean and standard deviation of every step along the states that ``value`` leads to."""
-        added = self.drive + value.transpose(0, 1) @ self.gain
-        states = [self.state]
+        noise, own = value.transpose(0, 1), self.transition.ndim == 3
+        pushed = torch.einsum("twl,wls->tws", noise, self.gain) if own else noise @ self.gain
+        added, states = self.drive + pushed, [self.state]
         for t in range(len(added) - 1):
-            states.append(torch.addmm(added[t], states[-1], self.transition))
-        z = torch.stack(states)[..., : len(self.gain)]
+            before, A = states[-1], self.transition
+            states.append(added[t] + (_rows(before, A) if own else before @ A))
+        z = torch.stack(states)[..., : self.gain.shape[-2]]
         mean, std = self.network(self.features, z)
         return mean, std
 

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from rich.box import Box
+    from rich.table import Table
 
-__all__ = ["BLUE", "clean", "facts", "figure_of", "panels", "partner"]
+__all__ = ["BLUE", "blocks", "clean", "facts", "figure_of", "panels", "partner"]
 
 BLUE = "#0072B2"
 _GRID = "#dddddd"
 _SHOWN = 6
+PADDING = 3
 
 
 def facts(title: str, rows: Mapping[str, object]) -> str:
@@ -67,6 +70,61 @@ def panels(ax: object, count: int, *, height: float = 2.1) -> tuple[Figure, list
         axes.remove()
         grid[count - 2].tick_params(labelbottom=True)
     return figure, grid[:count]
+
+
+def blocks(
+    title: str,
+    header: Sequence[str],
+    body: Sequence[Sequence[str]],
+    *,
+    width: int,
+    keys: int = 1,
+) -> list[Table]:
+    """A table for a terminal of ``width`` columns, cut into several where it does not fit.
+
+    No name and no number is cut: cells stay on one line, titles are broken between words, and the
+    first ``keys`` columns are repeated in every part.
+
+    >>> [len(t.columns) for t in blocks("", ["a", "b b", "c"], [["1" * 9] * 3], width=24)]
+    [2, 2]
+    """
+    from rich.table import Table
+
+    wide = [_width(name, [row[i] for row in body]) for i, name in enumerate(header)]
+    shared = sum(wide[:keys])
+    parts: list[list[int]] = [[]]
+    for i in range(keys, len(header)):
+        if parts[-1] and shared + sum(wide[j] for j in parts[-1]) + wide[i] > width:
+            parts.append([])
+        parts[-1].append(i)
+    tables = []
+    for n, part in enumerate(parts):
+        table = Table(title=title if n == 0 else None, box=_ruled(), title_justify="left")
+        for i in (*range(keys), *part):
+            side: Literal["left", "right"] = "left" if i < keys else "right"
+            words = "\n".join(_words(header[i]))
+            table.add_column(words, justify=side, no_wrap=True, overflow="fold")
+        for row in body:
+            table.add_row(*(row[i] for i in (*range(keys), *part)))
+        tables.append(table)
+    return tables
+
+
+def _ruled() -> Box:
+    from rich import box
+
+    return box.SIMPLE_HEAD
+
+
+def _words(title: str) -> list[str]:
+    """A title in lines: at its separators where it has some, else between its words."""
+    return title.split(" · ") if " · " in title else title.split(" ")
+
+
+def _width(title: str, cells: Sequence[str]) -> int:
+    from rich.cells import cell_len
+
+    return max(map(cell_len, (*_words(title), *cells)), default=0) + PADDING
 
 
 def figure_of(ax: Any) -> Figure:

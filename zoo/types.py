@@ -37,8 +37,8 @@ __all__ = ["Batch", "Layout", "Posterior", "Sites"]
 class Layout:
     """What a model must know of its data before it sees any: names, units, rate and lengths.
 
-    ``frames`` is the length that all movements have, if any; ``windows`` says that they are cut
-    from longer ones.
+    ``frames`` is the length that all movements have, if any, and ``span`` the shortest and the
+    longest where they differ; ``windows`` says that they are cut from longer ones.
     """
 
     kind: Literal["sequences", "pairs"]
@@ -48,6 +48,7 @@ class Layout:
     input_units: tuple[str, ...] = ()
     rate: float | None = None
     frames: int | None = None
+    span: tuple[int, int] | None = None
     windows: bool = False
 
     def __post_init__(self) -> None:
@@ -90,8 +91,9 @@ class Batch:
     For regression data ``values`` are the targets, ``inputs`` the features, ``time`` is absent
     and ``movements`` is empty. Missing entries are 0 in ``values`` and False in ``mask``;
     ``mask`` is None where nothing is missing. ``total`` and ``total_sequences`` count the whole
-    training set, so that a plate of that size scales a minibatch rightly. Where ``observed`` is
-    False a program draws its data instead of observing them; see :meth:`unobserved`.
+    training set, so that a plate of that size scales a minibatch rightly. ``lengths`` are those of
+    ``movements``, None where none of them is padded. Where ``observed`` is False a program draws
+    its data instead of observing them; see :meth:`unobserved`.
     """
 
     values: Float[Tensor, "window *time channel"]
@@ -103,12 +105,14 @@ class Batch:
     movement_mask: Bool[Tensor, "sequence frame observed"] | None
     total: int
     total_sequences: int
+    lengths: Int[Tensor, " sequence"] | None = None
     observed: bool = True
 
     @classmethod
     def blank(cls, layout: Layout, dtype: torch.dtype) -> Self:
         """One movement or item of zeros: what a program must see to know the sizes of its sites."""
-        frames = () if layout.kind == "pairs" else (layout.frames or 1,)
+        longest = layout.frames or (layout.span or (1, 1))[1]
+        frames = () if layout.kind == "pairs" else (longest,)
         values = torch.zeros(1, *frames, len(layout.channels), dtype=dtype)
         inputs = torch.zeros(1, *frames, len(layout.inputs), dtype=dtype)
         zero = torch.zeros(1, dtype=torch.long)
@@ -123,6 +127,13 @@ class Batch:
             total=1,
             total_sequences=len(frames),
         )
+
+    @property
+    def frames(self) -> Int[Tensor, " sequence"]:
+        """Length of every movement."""
+        if self.lengths is not None:
+            return self.lengths
+        return self.sequence.new_full((len(self.movements),), self.movements.shape[1])
 
     def __len__(self) -> int:
         """Number of windows."""

@@ -19,6 +19,10 @@ TIMES = ("time", "t", "seconds")
 FRAMES = ("frame", "frames")
 GROUPS = ("movement", "trial", "subject", "group", "session")
 _BRACKETS = re.compile(r"^(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
+_ATOM = r"(?:[munkMcd]?(?:m|s|g|N|V|A|W|J|Hz|Pa|rad|Nm)|µ(?:m|s|V)|deg|degrees|°|sec|min|h|%)"
+_POWER = r"(?:\^?-?[0-9]|[²³]|⁻[¹²])?"
+_UNIT = rf"{_ATOM}{_POWER}(?:[/·* ]{_ATOM}{_POWER})*"
+_PARENTHESES = re.compile(rf"^(?P<name>.*\S)\s*\((?P<unit>{_UNIT})\)$")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +44,12 @@ class Part:
 def name_and_unit(label: object, what: str = "column") -> tuple[str, str]:
     """A name and the unit that stands behind it in square brackets.
 
+    In parentheses a unit is one where it is known as such; anything else belongs to the name.
+
     >>> name_and_unit("knee [rad]"), name_and_unit("hip")
     (('knee', 'rad'), ('hip', ''))
+    >>> name_and_unit("knee (deg)"), name_and_unit("speed (m/s)"), name_and_unit("knee (left)")
+    (('knee', 'deg'), ('speed', 'm/s'), ('knee (left)', ''))
     """
     if isinstance(label, tuple):
         raise ValueError(
@@ -49,7 +57,7 @@ def name_and_unit(label: object, what: str = "column") -> tuple[str, str]:
             "frame.columns = ['_'.join(c) for c in frame.columns]"
         )
     text = str(label).strip()
-    found = _BRACKETS.match(text)
+    found = _BRACKETS.match(text) or _PARENTHESES.match(text)
     return (found["name"], found["unit"].strip()) if found else (text, "")
 
 

@@ -171,7 +171,8 @@ class Sequences:
         """Names, units, rate (None after time normalisation) and the length all have, if any."""
         if not len(self):
             raise ValueError(f"{self.name!r} holds no movement")
-        equal = bool((self.lengths == self.lengths[0]).all())
+        shortest, longest = int(self.lengths.min()), int(self.lengths.max())
+        equal = shortest == longest
         return Layout(
             kind="sequences",
             channels=self.channels,
@@ -179,7 +180,8 @@ class Sequences:
             inputs=self.control_names,
             input_units=self.control_units,
             rate=None if self.time_normalised else self.rate,
-            frames=int(self.lengths[0]) if equal else None,
+            frames=longest if equal else None,
+            span=None if equal else (shortest, longest),
             windows="start" in self.groups,
         )
 

@@ -14,10 +14,13 @@ import zoo
 from zoo.catalogue import CATALOGUE
 from zoo.datasets.records import Sequences
 from zoo.errors import MovementLengthError, WindowsWarning
+from zoo.prediction.prediction import Prediction
 from zoo.runs.run import Run
 
 NAMES = CATALOGUE.names(can="forecast")
 ENDING = ["vae-dmp", "vae-dmp-single", "ae-dmp", "sparse-ae-dmp", "ae-then-dmp"]
+WHOLE = ("ae-dmp", "sparse-ae-dmp", "ae-then-dmp")
+LENGTHS = (24, 20, 16, 24, 18, 22, 17, 19)
 PHASED = {"dmp", "promp", "pca-dmp", *ENDING}
 
 
@@ -76,11 +79,30 @@ def test_a_rhythmic_movement_goes_on() -> None:
     assert run_of("vae-dmp-rhythmic").forecast(movements(), horizon=9, draws=2).shape[1] == 9
 
 
-@pytest.mark.parametrize("name", ["vae-dmp", "vae-dmp-rhythmic", "ae-dmp"])
-def test_several_lengths_are_refused_by_name(name: str) -> None:
-    ragged = Sequences.from_arrays([np.zeros((9, 2)), np.ones((8, 2))], rate=30.0)
-    with pytest.raises(MovementLengthError, match=f"^{name} needs movements of one common length"):
-        zoo.create(name, ragged)
+@pytest.mark.parametrize("name", [*ENDING, "vae-dmp-rhythmic"])
+def test_movements_of_unlike_length_are_learned_and_asked_about(name: str) -> None:
+    cut = [x[:n] for x, n in zip(movements().arrays, LENGTHS, strict=True)]
+    unlike = Sequences.from_arrays(cut, rate=30.0)
+    few = {"epochs": 2, "batch_size": 16} | ({} if name in WHOLE else {"window": 10})
+    run = zoo.fit(zoo.create(name, unlike, **few), unlike)
+    for task in (run.reconstruct, run.represent):
+        assert frames_of(task(unlike, draws=2)) == list(LENGTHS)
+    forecast(run, unlike.first(10))
+    assert frames_of(run.impute(holed(unlike), draws=2)) == list(LENGTHS)
+
+
+@pytest.mark.parametrize("name", [*ENDING, "vae-dmp-rhythmic"])
+def test_movements_without_a_movement_in_them_are_refused_by_name(name: str) -> None:
+    short = Sequences.from_arrays([np.zeros((9, 2)), np.ones((2, 2))], rate=30.0)
+    with pytest.raises(MovementLengthError, match="at least 3 frames; got one of 2: leave it out"):
+        zoo.create(name, short)
+
+
+def frames_of(answer: Prediction) -> list[int]:
+    """Length of every movement of an answer."""
+    lengths = answer.lengths
+    assert lengths is not None
+    return lengths.tolist()
 
 
 def holed(data: Sequences) -> Sequences:

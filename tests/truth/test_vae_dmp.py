@@ -44,6 +44,14 @@ def movements(count: int = 3) -> Sequences:
     return Sequences.from_arrays(values.numpy(), rate=30.0)
 
 
+def unlike_movements() -> Sequences:
+    """One of 12 frames, one of 8 and one of 10."""
+    whole = movements().arrays
+    return Sequences.from_arrays(
+        [x[:n] for x, n in zip(whole, (12, 8, 10), strict=True)], rate=30.0
+    )
+
+
 SCALED = {"goal_scaling": True, "common_forcing": 0.1, "activation": "softplus"}
 
 
@@ -57,14 +65,18 @@ def build(
     return model, FilteringGuide(data.layout, model, own)
 
 
-@pytest.fixture(params=[{}, SCALED], ids=["plain", "goal-scaling"])
+KINDS = {"plain": {}, "goal-scaling": SCALED, "unlike-lengths": SCALED}
+
+
+@pytest.fixture(params=KINDS)
 def pair(request: pytest.FixtureRequest) -> Pair:
     torch.manual_seed(0)
-    data = movements()
-    model, guide = build(data, request.param)
+    unlike = request.param == "unlike-lengths"
+    data = unlike_movements() if unlike else movements()
+    model, guide = build(data, KINDS[request.param])
     if model.goal_scaling:
         torch.nn.init.normal_(model.w_common)
-    rows = torch.tensor([0, 3, 4, 8, 9, 20])
+    rows = torch.tensor([0, 3, 6, 8, 9, 14] if unlike else [0, 3, 4, 8, 9, 20])
     return model, guide, Loader(data, batch_size=6, window=6, seed=0).take(rows)
 
 
@@ -77,16 +89,22 @@ class PerStep:
     def states(self, batch, w, goal, start, z_1, v, recognise):
         """Roll (74) and call ``recognise(t, z_t)`` for the noise of every step."""
         model, system = self.model, self.model.system
+        lengths = batch.frames[batch.sequence, None]
+        τ = (lengths - 1) / (FRAMES - 1)
+        bases = {n: model.kernels_at(FRAMES, (n - 1) / (FRAMES - 1)) for n in range(8, 13)}
         if start is not None:
             w = w * (model.embed(goal) - model.embed(start))[:, None, :]
-        z, ż = model.embed(z_1), model.config.velocity_scale * v
+        z, ż = model.embed(z_1), model.config.velocity_scale * v / τ
         path = [z]
         for t in range(batch.values.shape[1] - 1):
             ε = recognise(t, z) @ model.w_noise
-            Ψ = model.basis[batch.start + t]
+            Ψ = torch.stack(
+                [bases[int(n)][s + t] for n, s in zip(lengths, batch.start, strict=True)]
+            )
             f = model.config.w_scale * torch.einsum("bk,bkl->bl", Ψ, w[batch.sequence])
             force = system.stiffness * (f + ε)
-            z̈ = system.alpha * (system.beta * (model.embed(goal)[batch.sequence] - z) - ż) + force
+            pull = system.beta * (model.embed(goal)[batch.sequence] - z)
+            z̈ = (system.alpha * (pull - τ * ż) + force) / τ**2
             ż = ż + z̈ * system.dt
             z = z + ż * system.dt
             path.append(z)
@@ -96,10 +114,11 @@ class PerStep:
         guide = self.guide
         h = guide.trunk(batch.values)
         with poutine.scale(scale=batch.total_sequences / len(batch.movements)):
-            w = pyro.sample("w", guide.weights(batch.movements))
-            goal = pyro.sample(
-                "goal", dist.Normal(*guide.encoder(guide.trunk(batch.movements[:, -1])))
+            w = pyro.sample("w", guide.weights(batch.movements, batch.lengths))
+            last = torch.stack(
+                [x[n - 1] for x, n in zip(batch.movements, batch.frames, strict=True)]
             )
+            goal = pyro.sample("goal", dist.Normal(*guide.encoder(guide.trunk(last))))
             start = None
             if self.model.goal_scaling:
                 moments = guide.encoder(guide.trunk(batch.movements[:, 0]))
@@ -281,10 +300,17 @@ def test_entries_that_are_missing_carry_no_gradient(pair: Pair):
     assert len(densities) == 2
 
 
-def test_unequal_lengths_are_refused_with_advice():
-    data = Sequences.from_arrays([np.zeros((9, 2)), np.ones((8, 2))], rate=30.0)
-    with pytest.raises(ValueError, match="one common length"):
+def test_movements_too_short_are_refused_with_advice():
+    data = Sequences.from_arrays([np.zeros((9, 2)), np.ones((2, 2))], rate=30.0)
+    with pytest.raises(ValueError, match="at least 3 frames; got one of 2: leave it out"):
         VaeDmp(data.layout, Config())
+
+
+def test_windows_are_padded_by_nothing():
+    data = unlike_movements()
+    model, guide = build(data)
+    with pytest.raises(ValueError, match="set window=8 or less"):
+        bound(model, guide, whole(data))
 
 
 def prior(movements: int = 3, time: int = 6) -> PathPrior:
@@ -424,8 +450,8 @@ def test_goal_change_ends_at_the_goal_and_none_is_the_demonstration():
         same = model._aimed(found, found.goal)
         torch.testing.assert_close(same.w, found.w)
         moved = model._aimed(replace(found, w=0 * found.w), found.goal + 1.0)
-        torch.testing.assert_close(model._pull(moved, 2.0)[:, :, -1], moved.goal)
-        assert model._pull(moved, 2.0).shape[2] == 2 * (FRAMES - 1)
+        torch.testing.assert_close(model._pull(moved, 2 * (FRAMES - 1), 2.0)[:, :, -1], moved.goal)
+        assert model._pull(moved, 2 * (FRAMES - 1), 2.0).shape[2] == 2 * (FRAMES - 1)
 
 
 def test_goal_scaling_keeps_the_shape_of_the_path():
@@ -439,7 +465,7 @@ def test_goal_scaling_keeps_the_shape_of_the_path():
         shapes = []
         for goal in (found.goal, found.goal + 1.5, 3 - found.goal):
             aimed = model._aimed(found, goal)
-            force = model.system.stiffness * model._pull(aimed, 1.0)
+            force = model.system.stiffness * model._pull(aimed, FRAMES - 1, 1.0)
             response = Response.of(model.system, FRAMES, force.dtype, force.device)
             args = aimed.position, aimed.velocity, torch.zeros_like(aimed.position), force
             path = response.states(*args)[0]
@@ -505,7 +531,8 @@ def test_the_path_to_another_goal_ends_there(duration: float):
     with torch.no_grad():
         found = model._latents(GuidePosterior(guide).draw(whole(data), 3))
         aimed = model._aimed(found, found.goal + torch.randn_like(found.goal))
-        pull = model._ended(aimed, model._pull(aimed, duration), duration)
+        steps = round((FRAMES - 1) * duration)
+        pull = model._ended(aimed, model._pull(aimed, steps, duration), duration)
         system = replace(model.system, tau=duration)
         z, ż = aimed.position, aimed.velocity / duration
         for t in range(pull.shape[2]):

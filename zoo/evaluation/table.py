@@ -9,11 +9,12 @@ from dataclasses import asdict, dataclass
 from io import StringIO
 from typing import TYPE_CHECKING, Any, Self
 
+from zoo.display import blocks
 from zoo.evaluation.answers import Estimate
 from zoo.evaluation.scores import SCORES, Scores
 
 if TYPE_CHECKING:
-    from rich.table import Table as RichTable
+    from rich.console import Console, ConsoleOptions, RenderResult
 
 __all__ = ["Refusal", "Row", "Table", "readable"]
 
@@ -158,18 +159,12 @@ class Table:
         lines = ["| " + " | ".join(cells) + " |" for cells in (self.header, rule, *self.body)]
         return "\n".join([f"**{self.title}**", "", *lines, "", self.legend])
 
-    def __rich__(self) -> RichTable:
-        """What ``rich`` prints."""
-        from rich import box
-        from rich.table import Table as RichTable
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """What ``rich`` prints: parts one below the other where the terminal is narrow."""
+        from rich.text import Text
 
-        table = RichTable(title=self.title, caption=self.legend, box=box.SIMPLE_HEAD)
-        table.title_justify = table.caption_justify = "left"
-        for i, name in enumerate(self.header):
-            table.add_column(name, justify="left" if i < 2 else "right", no_wrap=i < 2)
-        for cells in self.body:
-            table.add_row(*(cell.replace("± ", "±\N{NO-BREAK SPACE}") for cell in cells))
-        return table
+        yield from blocks(self.title, self.header, self.body, width=options.max_width, keys=2)
+        yield Text(self.legend, style="dim italic")
 
     def __str__(self) -> str:
         """The table as plain text."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from zoo.faces.options import (
     Data,
@@ -23,6 +21,7 @@ from zoo.faces.options import (
     Version,
 )
 from zoo.faces.reproduce import experiment, interruptible, leaderboard
+from zoo.faces.terminal import said_plainly, show
 
 __all__ = ["app", "main"]
 
@@ -68,7 +67,7 @@ def list_command(
     elif markdown:
         print(models_markdown(entries))
     else:
-        Console().print(models_table(entries))
+        show(models_table(entries))
 
 
 @app.command()
@@ -81,7 +80,7 @@ def card(name: Annotated[str, typer.Argument(help="Name of a model.")], json: Js
     if json:
         print_json(found.to_json())
     else:
-        Console().print(found)
+        show(found)
 
 
 @app.command()
@@ -97,13 +96,13 @@ def data(
 
     if name is None:
         names = list_data()
-        print_json(names) if json else Console().print(data_table(names))
+        print_json(names) if json else show(data_table(names))
         return
     given: dict[str, Any] = {
         k: v for k, v in {"folder": folder, "rate": rate}.items() if v is not None
     }
     description = describe(load_data(name, **given))
-    print_json(description) if json else Console().print(data_table(description))
+    print_json(description) if json else show(data_table(description))
 
 
 @app.command()
@@ -149,9 +148,9 @@ def fit(
         print_json(score(run, test).to_json() | {"report": run.report()})
         return
     if run.report():
-        Console().print(report_table(run))
-    Console().print(score(run, test))
-    Console().print(f"Run written to [bold]{run_dir}[/]; next: zoo evaluate {run_dir}")
+        show(report_table(run))
+    show(score(run, test))
+    show(f"Run written to [bold]{run_dir}[/]; next: zoo evaluate {run_dir}")
 
 
 @app.command()
@@ -169,7 +168,7 @@ def evaluate(
 
     run, test = open_run(run_dir, data)
     table = score(run, test, tasks=task)
-    print_json(table.to_json()) if json else Console().print(table)
+    print_json(table.to_json()) if json else show(table)
     if figure is not None:
         reliability_figure(run, test, figure)
 
@@ -194,7 +193,7 @@ def forecast(
 
         print_json(report.to_json())
     else:
-        Console().print(report)
+        show(report)
 
 
 @app.command("play")
@@ -232,17 +231,12 @@ app.command()(experiment)
 app.command()(leaderboard)
 
 
-def _warn(message: Warning | str, *_: object) -> None:
-    print(f"zoo: warning: {message}", file=sys.stderr)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; what the user can mend is one line on stderr, not a traceback."""
     from zoo.errors import DamagedRunError, RunLockedError, TrainingError
 
     try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _warn  # type: ignore[assignment]
+        with said_plainly():
             app(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)

@@ -7,11 +7,10 @@ import sys
 import time
 from pathlib import Path
 
-from rich.console import Console
-
 from zoo.datasets.library import load_data
 from zoo.datasets.records import Sequences
 from zoo.faces.commands import forecast_figure, reliability_figure
+from zoo.faces.terminal import said_plainly, show
 from zoo.runs.fitting import fit
 from zoo.runs.run import create, evaluate
 
@@ -37,10 +36,10 @@ def demo_data() -> tuple[Sequences, tuple[float, ...]]:
 
 def main(folder: Path = Path("demo")) -> int:
     """Train, calibrate, forecast and evaluate; everything written is under ``folder``."""
-    console, began = Console(), time.monotonic()
+    began = time.monotonic()
     data, shares = demo_data()
     train, val, calib, test = data.split(by="trial", parts=shares, seed=0)
-    console.print(
+    show(
         f"[bold]{data.name}[/] ({data.provenance}): {len(train)} movements to train on, "
         f"{len(val)} to validate, {len(calib)} to calibrate, {len(test)} held out"
     )
@@ -49,12 +48,12 @@ def main(folder: Path = Path("demo")) -> int:
     run.calibrate(calib)
     run.save(folder / "run")
     table = evaluate(run, test, tasks=["forecast", "reconstruct"])
-    console.print(table)
+    show(table)
     seen = max(2, int(test.lengths.min()) // 7)
     prediction = run.forecast(test.first(seen), horizon=int(test.lengths.min()) - seen)
     forecast_figure(prediction, test, seen, folder / "forecast.png")
     reliability_figure(run, test, folder / "reliability.png")
-    console.print(
+    show(
         f"Forecasts after {seen} frames with their bands: {folder / 'forecast.png'}; "
         f"calibration: {folder / 'reliability.png'}; {time.monotonic() - began:.0f} s in all"
     )
@@ -62,4 +61,5 @@ def main(folder: Path = Path("demo")) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with said_plainly():
+        sys.exit(main())

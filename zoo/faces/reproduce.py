@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from zoo.faces.options import Json
+from zoo.faces.terminal import show
 
 __all__ = ["experiment", "interruptible", "leaderboard"]
 
@@ -30,11 +30,12 @@ def experiment(
 
     if identifier is None:
         listing = {k: e.summary for k, e in EXPERIMENTS.items()}
-        print_json(listing) if json else Console().print(data_table(listing))
+        print_json(listing) if json else show(data_table(listing))
         return
+    _announce(identifier, quick)
     with interruptible("repeat the command to go on from the last checkpoint"):
         result = run_experiment(identifier, output, quick=quick, progress=not json)
-    print_json(result.to_json()) if json else Console().print(result)
+    print_json(result.to_json()) if json else show(result)
 
 
 def leaderboard(
@@ -68,7 +69,7 @@ def leaderboard(
 
     if name is None and data is None:
         listing = {k: f"{p.summary}; {p.protocol}" for k, p in PROTOCOLS.items()}
-        print_json(listing) if json else Console().print(data_table(listing))
+        print_json(listing) if json else show(data_table(listing))
         return
     with interruptible("repeat the command: what was found is kept under runs/leaderboard"):
         result = run_leaderboard(
@@ -80,7 +81,22 @@ def leaderboard(
             jobs=jobs,
             note=lambda line: print(line, file=sys.stderr),
         )
-    print_json(result.to_json()) if json else Console().print(result)
+    print_json(result.to_json()) if json else show(result)
+
+
+def _announce(identifier: str, quick: bool) -> None:
+    """Say how long an experiment took when its stored result was measured."""
+    from zoo.inference.progress import spoken
+    from zoo.studies.stored import stored
+
+    try:
+        took = stored(identifier).payload
+    except (OSError, LookupError, ValueError):
+        return
+    seconds = max(took.get("training_seconds") or 0.0, took.get("seconds") or 0.0)
+    if seconds and not quick:
+        told = f"{identifier}: {spoken(seconds)} of training when it was last measured"
+        print(f"{told}; what is trained already under runs/ is not trained again", file=sys.stderr)
 
 
 @contextmanager

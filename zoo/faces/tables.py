@@ -31,7 +31,10 @@ def print_json(value: Any) -> None:
 
 def models_table(entries: Iterable[Entry]) -> Table:
     """Entries with their tasks, a line each."""
-    table = Table("model", "what it is", "can", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("model", no_wrap=True, overflow="fold")
+    table.add_column("what it is")
+    table.add_column("can", overflow="fold")
     for entry in entries:
         table.add_row(
             f"[bold]{entry.name}[/]",

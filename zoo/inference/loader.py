@@ -107,6 +107,7 @@ class _Windows:
         self.total = len(self.sequence)
         self.movements = data.values
         self.movement_mask = None if bool(data.mask.all()) else data.mask
+        self.lengths = None if bool((data.lengths == frames).all()) else data.lengths
         self.device = data.values.device
         self.frames = data.values.flatten(0, 1)
         self.first = self.sequence * frames + self.start
@@ -125,7 +126,7 @@ class _Windows:
     def take(self, rows: Tensor) -> Batch:
         index = (self.first[rows, None] + self.step).flatten().to(self.device)
         shape = (len(rows), self.window, -1)
-        movements, movement_mask, sequence = self._movements(self.sequence[rows])
+        movements, movement_mask, lengths, sequence = self._movements(self.sequence[rows])
         every = self.is_whole and len(rows) == self.total and bool((rows.diff() == 1).all())
         values = self.movements.clone() if every else self.frames.index_select(0, index)
         return Batch(
@@ -138,6 +139,7 @@ class _Windows:
             movement_mask=movement_mask,
             total=self.total,
             total_sequences=len(self.movements),
+            lengths=lengths,
         )
 
     def _inputs(self, rows: Tensor) -> Tensor | None:
@@ -148,14 +150,15 @@ class _Windows:
         frame = self.start[rows, None] + steps
         return self.controls[self.sequence[rows, None], frame]
 
-    def _movements(self, sequence: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
+    def _movements(self, sequence: Tensor) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor]:
         kept, inverse = torch.unique(sequence, return_inverse=True)
+        mask, lengths = self.movement_mask, self.lengths
         if len(kept) == len(self.movements):
-            return self.movements, self.movement_mask, sequence
+            return self.movements, mask, lengths, sequence
         kept = kept.to(self.device)
-        mask = self.movement_mask
         kept_mask = None if mask is None else mask.index_select(0, kept)
-        return self.movements.index_select(0, kept), kept_mask, inverse
+        kept_lengths = None if lengths is None else lengths.index_select(0, kept)
+        return self.movements.index_select(0, kept), kept_mask, kept_lengths, inverse
 
 
 class _Items:

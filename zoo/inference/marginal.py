@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from torch import nn
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
@@ -169,7 +170,8 @@ def _bar(show: bool, total: int) -> Iterator[Any]:
         TaskProgressColumn(),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, disable=not show, transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not show, transient=True) as bar:
         task = bar.add_task("marginal likelihood", total=total)
         yield lambda value: bar.update(
             task, advance=1, description=f"marginal likelihood, −log p(y) = {value:.6g}"

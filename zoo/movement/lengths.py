@@ -5,22 +5,28 @@ from __future__ import annotations
 from zoo.errors import MovementLengthError
 from zoo.types import Layout
 
-__all__ = ["check_end", "check_whole", "common_length"]
+__all__ = ["check_end", "check_whole", "checked_span"]
+
+LEAST = 3
 
 
-def common_length(label: str, layout: Layout) -> int:
-    """The one length of all movements, in frames."""
-    if layout.frames is None or layout.frames < 3:
+def checked_span(label: str, layout: Layout) -> tuple[int, int]:
+    """Frames of the shortest and of the longest movement."""
+    if layout.frames is None and layout.span is None:
+        raise MovementLengthError(f"{label} needs movements whose lengths are known; got none")
+    shortest, longest = layout.span or (layout.frames or 0, layout.frames or 0)
+    if shortest < LEAST:
         raise MovementLengthError(
-            f"{label} needs movements of one common length of at least 3 frames; got "
-            f"{'several lengths' if layout.frames is None else layout.frames}: "
-            "bring them to n frames by data.resampled(n), or cut them by data.windows(n)"
+            f"{label} needs movements of at least {LEAST} frames; got one of {shortest}: leave it "
+            "out, or bring all to n frames by data.resampled(n)"
         )
-    return layout.frames
+    return shortest, longest
 
 
-def check_whole(label: str, frames: int, given: int) -> None:
-    """Refuse movements that are not as long as those trained on."""
+def check_whole(label: str, frames: int, given: int, ragged: bool = False) -> None:
+    """Refuse movements unlike those trained on: of one length, or of several."""
+    if ragged and given >= LEAST:
+        return
     if given != frames:
         raise MovementLengthError(
             f"movements have {given} frames; this {label} was made for {frames}: a part of a "

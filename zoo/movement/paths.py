@@ -10,13 +10,13 @@ from typing import ClassVar, Self
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
 
-from zoo.movement.components import alike
 from zoo.movement.gaussian_paths import block_diagonal, cholesky, stationary
 from zoo.movement.kernel_mixture import KernelMixture
 
 __all__ = ["Conditioned", "PathPrior", "Readout"]
+
+HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -89,30 +89,19 @@ class PathPrior(KernelMixture):
         rows = where.repeat_interleave(latent).nonzero()[:, 0]
         noise = self.observation if extra is None else self.observation + extra[..., where, :, :]
         factor = cholesky(full[rows][:, rows] + block_diagonal(noise, int(where.sum())))
+        volume = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + len(rows) * HALF_LOG_2PI
         half = torch.linalg.solve_triangular(factor, full[rows], upper=False)
         means = self.means.flatten(1)
         apart = seen.flatten(-2)[..., None, rows] - means[:, rows]
         white = torch.linalg.solve_triangular(factor, apart.mT, upper=False).mT
+        each = -0.5 * white.square().sum(-1)
         return Conditioned(
             means=(means + white @ half).unflatten(-1, (time, latent)),
             log_weights=torch.log_softmax(-0.5 * white.square().sum(-1), dim=-1),
             prior=full,
             known=half,
+            log_evidence=each.logsumexp(-1) - math.log(len(means)) - volume,
         )
-
-    def completed(
-        self,
-        seen: Float[Tensor, "sequence seen latent"],
-        where: Bool[Tensor, "sequence seen"],
-        draws: int,
-    ) -> Float[Tensor, "sample sequence time latent"]:
-        """Joint draws of whole paths given their first frames, ``where`` these were observed."""
-        beyond = self.paths.shape[1] - seen.shape[1]
-        paths = seen.new_empty(draws, len(seen), *self.paths.shape[1:])
-        values = pad(seen.double(), (0, 0, 0, beyond))
-        for rows, frames in alike(pad(where, (0, beyond))):
-            paths[:, rows] = self.condition(values[rows], frames).sample(draws).to(seen)
-        return paths
 
     def tuned(self, seen: Sequence[int], readout: Readout, without: Callable[[int], Self]) -> Self:
         """The h, λ and ν with the best density of held-out futures, after ``seen`` frames each.
@@ -152,13 +141,15 @@ class Readout:
 class Conditioned:
     """A mixture over paths after frames were observed; all components share the covariance.
 
-    That is the ``prior``'s less what is ``known``, knownᵀ known.
+    That is the ``prior``'s less what is ``known``, knownᵀ known; ``log_evidence`` is the log
+    density of the frames observed.
     """
 
     means: Float[Tensor, "*batch component time latent"]
     log_weights: Float[Tensor, "*batch component"]
     prior: Float[Tensor, "path path"]
     known: Float[Tensor, "*#batch seen path"]
+    log_evidence: Float[Tensor, "*batch"]
 
     @property
     def covariance(self) -> Float[Tensor, "*#batch path path"]:

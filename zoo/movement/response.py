@@ -71,19 +71,22 @@ class Transformation:
         return bool(torch.linalg.eigvals(transition_matrix(self)).abs().max() < 1)
 
 
-def critical_system(alpha: float | None, frames: int) -> Transformation:
+def critical_system(
+    alpha: float | None, frames: int, shortest: int | None = None
+) -> Transformation:
     """The critically damped system, β = α/4, a movement of ``frames`` frames long in its unit.
 
     None for α is 25, or 0.4 a frame for movements under 64 frames: more makes Euler steps unstable.
+    α is that of the ``shortest`` movements where these have fewer frames.
     """
-    α = min(ALPHA, ALPHA_FRAME * (frames - 1)) if alpha is None else alpha
-    system = Transformation(α, α / 4, 1.0, 1 / (frames - 1))
-    if not system.stable:
+    least = frames if shortest is None else shortest
+    α = min(ALPHA, ALPHA_FRAME * (least - 1)) if alpha is None else alpha
+    if not Transformation(α, α / 4, 1.0, 1 / (least - 1)).stable:
         raise ValueError(
-            f"alpha = {α:g} makes Euler steps of {frames} frames a movement unstable; "
-            f"{ALPHA_FRAME * (frames - 1):.3g} is safe"
+            f"alpha = {α:g} makes Euler steps of {least} frames a movement unstable; "
+            f"{ALPHA_FRAME * (least - 1):.3g} is safe"
         )
-    return system
+    return Transformation(α, α / 4, 1.0, 1 / (frames - 1))
 
 
 def transition_matrix(system: Transformation) -> Float[Tensor, "2 2"]:

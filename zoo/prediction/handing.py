@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["as_frame", "as_xarray", "band_panel", "picture"]
+__all__ = ["as_frame", "as_xarray", "band_panel", "picture", "told"]
 
 ALPHAS = (0.22, 0.38)
 MOST = 4
@@ -57,6 +57,16 @@ class Told(Protocol):
     def channel(self, name: str) -> int:
         """Index of a channel or target by name."""
         ...
+
+
+def told(prediction: Told, *, calibrated: bool) -> dict[str, object]:
+    """What a notebook shows of a prediction, by name."""
+    rows: dict[str, object] = dict(zip(prediction.axes, prediction.shape, strict=True))
+    rows[f"{prediction.axes[-1]}s"] = prediction.names
+    rows["units"] = tuple(dict.fromkeys(prediction.units))
+    if not prediction.has_spread:
+        return {**rows, "bands": "none: the answer is deterministic"}
+    return {**rows, "bands": "calibrated" if calibrated else "as the model gave them"}
 
 
 def as_xarray(prediction: Told, level: float = 0.9) -> xarray.Dataset:

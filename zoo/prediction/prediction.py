@@ -268,12 +268,7 @@ class Prediction:
 
     def _repr_html_(self) -> str:
         """Sizes, units and spread, for a notebook."""
-        rows: dict[str, object] = dict(zip(self.axes, self.shape, strict=True))
-        rows[f"{self.axes[-1]}s"] = self.names
-        rows["units"] = tuple(dict.fromkeys(self.units))
-        rows["spread"] = "yes" if self.has_spread else "none: the answer is deterministic"
-        raw = self.recalibration is None
-        rows["bands"] = "as the model gave them" if raw else "calibrated"
+        rows = handing.told(self, calibrated=self.recalibration is not None)
         return facts(f"Prediction of {self.task}", rows)
 
     def _need_spread(self) -> None:

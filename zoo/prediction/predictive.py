@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import overload
 
 import torch
@@ -160,13 +160,15 @@ class Predictive:
     def concat(cls, parts: Sequence[Predictive]) -> Predictive:
         """The distributions of several sets of sequences or items, one after the other.
 
-        Raises ValueError where one has noise, epistemic or draws and another has not.
+        A single component stands for as many equal ones as others have. Raises ValueError where one
+        has noise, epistemic or draws and another has not.
 
         >>> one = Predictive(location=torch.zeros(1, 2, 3), noise=torch.ones(3))
         >>> Predictive.concat([one, one]).location.shape
         torch.Size([1, 4, 3])
         """
-        wide = [part.map(lambda tensor: tensor) for part in parts]
+        count = max(len(part.location) for part in parts)
+        wide = [_components(part, count).map(lambda tensor: tensor) for part in parts]
         return cls(
             location=torch.cat([p.location for p in wide], 1),
             noise=_joined("noise", [p.noise for p in wide]),
@@ -193,6 +195,14 @@ class Predictive:
     def _held(self) -> Deferred | Tensor | None:
         held: Deferred | Tensor | None = self.__dict__["_draws"]
         return held
+
+
+def _components(part: Predictive, count: int) -> Predictive:
+    """The same distribution by ``count`` components, where it has one."""
+    if len(part.location) in (1, count) and count > 1:
+        location = part.location.expand(count, *part.location.shape[1:])
+        return replace(part, location=location, draws=part._held)
+    return part
 
 
 def _joined(what: str, parts: Sequence[Tensor | None]) -> Tensor | None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import Markdown
 
+from zoo.display import blocks
 from zoo.errors import UnknownNameError
 from zoo.studies.kept import timed
 
@@ -119,8 +120,17 @@ class Result:
         return {} if known is None else {"training_seconds": round(known, 1)}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """The table for a terminal."""
-        yield Markdown(self.markdown())
+        """The tables for a terminal, in parts where it is narrow, and the findings."""
+        yield Markdown(f"# {self.identifier}: {self.title}\n\nData: {self.source}.")
+        parts: list[Result | Section] = [self, *self.sections]
+        for part in parts:
+            yield from blocks(
+                part.title if part is not self else "",
+                part.columns,
+                [[_cell(value) for value in row] for row in part.rows],
+                width=options.max_width,
+            )
+        yield Markdown("\n".join(f"- {f}" for f in self.findings))
 
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import pyro.distributions as dist
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import Field
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from zoo.contract.settings import Count, Positive, settings
-from zoo.movement.lengths import common_length
+from zoo.movement.durations import lengths_of, moves, pace, windows_of
+from zoo.movement.lengths import check_whole, checked_span
 from zoo.movement.plan import Latents, Plan
-from zoo.movement.response import (
-    critical_system,
-    discrete_basis,
-    input_vector,
-    transition_matrix,
-)
+from zoo.movement.response import Transformation, critical_system, discrete_basis
 from zoo.nn.metric import jacobians
 from zoo.nn.mlp import Activation, mlp
 from zoo.prediction.predictive import Predictive
-from zoo.types import Layout
+from zoo.types import Batch, Layout
 
 __all__ = ["Config", "LatentDmp"]
 
@@ -88,13 +85,14 @@ class LatentDmp(nn.Module):
     step_input: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
-        """A model of movements of ``layout.frames`` frames, all of one length."""
+        """A model of the movements of ``layout``, the longest as the unit of time."""
         super().__init__()
-        self.config, self.frames = config, common_length(self.label, layout)
+        shortest, self.frames = checked_span(self.label, layout)
+        self.config, self.is_ragged = config, shortest < self.frames
         self.latent_dim, self.kernels = config.latent_dim, config.kernels
         self.goal_scaling = config.goal_scaling
         channels, latent = len(layout.channels), config.latent_dim
-        self.system = critical_system(config.alpha, self.frames)
+        self.system = critical_system(config.alpha, self.frames, shortest)
         self.decoder = mlp([latent, config.hidden, channels], config.activation)
         self.g = mlp([latent, config.transition_hidden, latent], "tanh")
         nn.init.zeros_(self.g[-1].weight)  # type: ignore[arg-type]
@@ -106,11 +104,9 @@ class LatentDmp(nn.Module):
         else:
             self.w_noise = nn.Parameter(w_noise)
         self.output_root = nn.Parameter(torch.full((channels,), config.output_std**0.5))
-        eye = torch.eye(latent, dtype=torch.float64)
-        matrix = transition_matrix(self.system).T.contiguous()
         self.register_buffer("basis", self.kernels_at(self.frames - 1).to(self.w_noise))
-        self.register_buffer("step_matrix", torch.kron(matrix, eye).to(self.w_noise))
-        step_input = torch.kron(input_vector(self.system)[None], eye)
+        step_matrix, step_input = moves(self.system, latent)
+        self.register_buffer("step_matrix", step_matrix.to(self.w_noise))
         self.register_buffer("step_input", step_input.to(self.w_noise))
 
     @property
@@ -118,10 +114,38 @@ class LatentDmp(nn.Module):
         """The constant standard deviation of every channel, (83)."""
         return self.output_root.square() + self.config.output_floor
 
-    @property
-    def transition(self) -> Float[Tensor, "state state"]:
-        """A of (76) for row vectors (z*, ż)."""
-        return self.step_matrix
+    def lengths(self, batch: Batch) -> Int[Tensor, " sequence"] | None:
+        """Frames of every movement; None where all have τ = 1."""
+        return lengths_of(batch, self.frames)
+
+    def pace(self, frames: int) -> float:
+        """τ of a movement of ``frames`` frames, too few of which are refused."""
+        return pace(self.label, self.system, frames, self.frames)
+
+    def lasting(self, frames: int) -> Transformation:
+        """The system of a movement of ``frames`` frames: its τ is its share of the longest."""
+        return replace(self.system, tau=self.pace(frames))
+
+    def _whole(self, batch: Batch) -> int:
+        """Frames of whole movements, of which this model can roll out as many."""
+        frames = batch.values.shape[1]
+        check_whole(self.label, self.frames, frames, self.is_ragged)
+        self.pace(frames)
+        return frames
+
+    def transition(self, batch: Batch) -> Float[Tensor, "*window state state"]:
+        """A of (76) for row vectors (z*, ż), of every window where movements differ in τ."""
+        return self._moves(batch)[0]
+
+    def _moves(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """A and the input's rows, shared or of every window."""
+        lengths = self.lengths(batch)
+        if lengths is None:
+            return self.step_matrix, self.step_input
+        each, which = windows_of(batch, lengths).unique(return_inverse=True)
+        found = [moves(self.lasting(n), self.latent_dim) for n in each.tolist()]
+        step, push = (torch.stack(part).to(self.w_noise) for part in zip(*found, strict=True))
+        return step[which], push[which]
 
     def embed(self, z: Float[Tensor, "*batch latent"]) -> Float[Tensor, "*batch latent"]:
         """z* = g(z)."""

@@ -11,7 +11,9 @@ from zoo.errors import NotFittedError
 from zoo.inference.laplace import laplace
 from zoo.models.filters.latent_dmp import Config, LatentDmp
 from zoo.movement.demonstrations import extremes, seen_entries
+from zoo.movement.durations import stretched
 from zoo.movement.lengths import check_end
+from zoo.movement.paces import ConditionedPaces, Paces, lengthened, paced
 from zoo.movement.paths import Conditioned, PathPrior, Readout
 from zoo.movement.response import Response
 from zoo.prediction.predictive import Predictive
@@ -23,6 +25,7 @@ _LEARNED = ("prior_movements", "prior_residuals", "prior_observation", "prior_sh
 PRIOR_DRAWS = 32
 RESTARTS, KEPT = 4, 64
 UNSEEN = 1e6
+SEEN = 1 - 1e-6
 
 
 class LatentPathPrior(LatentDmp):
@@ -37,13 +40,16 @@ class LatentPathPrior(LatentDmp):
     prior_residuals: Tensor
     prior_observation: Tensor
     prior_shape: Tensor
+    prior_lengths: Tensor
     reached: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
-        """A model of movements of ``layout.frames`` frames, all of one length."""
+        """A model of the movements of ``layout``, the longest as the unit of time."""
         super().__init__(layout, config)
         for name in _LEARNED:
             self.register_buffer(name, torch.empty(0))
+        if self.is_ragged:
+            self.register_buffer("prior_lengths", torch.empty(0, dtype=torch.long))
 
     def forecast(
         self, batch: Batch, posterior: Posterior | None, *, horizon: int, draws: int
@@ -62,17 +68,23 @@ class LatentPathPrior(LatentDmp):
         """Keep the latents of the training movements, and what the encoder sees beside them.
 
         The residuals are what the noise ε must add for the paths to pass through the encoded
-        frames; how far new movements may be from those known is found by leaving each out.
+        frames, at equal phases of movements that last unlike long; how far new movements may be
+        from those known is found by leaving each out.
         """
         found = self._latents(posterior.draw(batch, PRIOR_DRAWS))
         parts = (found.w, *(v.unsqueeze(2) for v in (found.goal, found.position, found.velocity)))
         self.prior_movements = torch.cat([v.mean(0) for v in parts], dim=1).detach()
         self.reached = extremes(batch.values, seen_entries(batch))
-        frames, seen = self._observe(batch, posterior), self._frames_seen(batch)
+        lengths = self.lengths(batch)
+        if self.is_ragged:
+            self.prior_lengths = batch.frames
+        frames = stretched(self._observe(batch, posterior), lengths, self.frames)
+        seen = self._frames_seen(batch)[..., None].to(frames)
+        seen = stretched(seen, lengths, self.frames) > SEEN
         self.prior_residuals = torch.zeros_like(frames)
         self.prior_shape = frames.new_empty(0)
         rolled = self._prior(self.frames).paths.to(frames)
-        self.prior_residuals = ((frames - rolled) * seen[..., None]).detach()
+        self.prior_residuals = ((frames - rolled) * seen).detach()
         tuned = self._prior(self.frames).tuned(
             (self.frames // 7, self.frames // 2), self._readout(frames), self.prior_without
         )
@@ -114,26 +126,38 @@ class LatentPathPrior(LatentDmp):
             return torch.ones(batch.values.shape[:2], dtype=torch.bool, device=self.basis.device)
         return batch.mask.all(-1)
 
-    def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
-        """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
+    def _paced(self, seen: int, length: int) -> PathPrior | Paces:
+        """The mixture over latent paths of movements of which ``seen`` frames are known."""
+        if not self.is_ragged or not self.phased:
+            return self._prior(length)
+        return paced(lambda n: self._prior(length, lasting=n), self.prior_lengths, seen)
+
+    def _prior(
+        self, length: int, rows: Tensor | None = None, lasting: int | None = None
+    ) -> PathPrior:
+        """The mixture over latent paths of ``length`` frames, in float64, of some movements.
+
+        ``lasting`` is how many frames whole ones have, None: as many as the longest.
+        """
         if not self.prior_movements.numel():
             raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
         movements, residuals, observation = self._known(rows)
-        u, missing = movements.double(), length - self.frames
-        response = Response.of(self.system, length, torch.float64, u.device)
+        u, whole = movements.double(), self.frames if lasting is None else lasting
+        missing, τ = length - whole, self.pace(whole)
+        response = Response.of(self.lasting(whole), length, torch.float64, u.device)
         force = self.system.stiffness * torch.cat(
-            [self.config.w_scale * self.kernels_at(length - 1), torch.ones(length - 1, 1)], dim=1
+            [self.config.w_scale * self.kernels_at(length - 1, τ), torch.ones(length - 1, 1)], dim=1
         )
         start = torch.zeros(2, self.kernels + 3, dtype=torch.float64)
-        start[0, -2] = start[1, -1] = 1.0
+        start[0, -2], start[1, -1] = 1.0, 1 / τ
         φ = response.product(start, nn.functional.pad(force, (0, 2)))[0]
         return PathPrior.of_responses(
             φ,
             u,
             _variances(u),
-            nn.functional.pad(residuals.double(), (0, 0, 0, missing)),
+            nn.functional.pad(stretched(residuals.double(), None, whole), (0, 0, 0, missing)),
             observation.double().mean(0),
-            self.prior_shape.tolist(),
+            lengthened(self.prior_shape.tolist(), max(0, missing) / whole),
         )
 
     def _known(self, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -145,12 +169,14 @@ class LatentPathPrior(LatentDmp):
             self.prior_observation[kept],
         )
 
-    def _conditioned(self, batch: Batch, posterior: Posterior, length: int) -> Conditioned:
+    def _conditioned(
+        self, batch: Batch, posterior: Posterior, length: int
+    ) -> Conditioned | ConditionedPaces:
         """p(z*_{1:length} | frames observed)."""
         seen = batch.values.shape[1]
-        if self.phased:
+        if self.phased and (length > seen or not self.is_ragged):
             check_end(self.label, self.frames, seen, length - seen)
-        prior = self._prior(length)
+        prior = self._paced(seen, length)
         where = torch.arange(length) < seen
         y = self.embed(posterior.encode(batch.values, batch.mask).mean)
         extra = None

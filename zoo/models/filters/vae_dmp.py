@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from zoo.contract.readiness import need
+from zoo.errors import MovementLengthError
 from zoo.models.filters.latent_changes import LatentChanges
 from zoo.models.filters.latent_dmp import Config
 from zoo.models.filters.latent_path_prior import LatentPathPrior
-from zoo.movement.lengths import check_whole
+from zoo.movement.durations import timed_paths, windows_of
 from zoo.movement.plan import Plan
 from zoo.movement.response import Response
 from zoo.prediction.predictive import Predictive
@@ -43,15 +44,20 @@ class VaeDmp(LatentPathPrior, LatentChanges):
     frames observed (:class:`~zoo.movement.paths.PathPrior`). ``python -m
     benchmarks.latent_path_prior`` takes the two apart. A frame observed in part is a Gaussian at
     the mode of p(z | x_seen), which the decoder gives. σ is estimated again on movements that the
-    networks were not trained on, where there are any (:meth:`learn_noise`). Movements must have one
-    common length, and end there.
+    networks were not trained on, where there are any (:meth:`learn_noise`).
+
+    Movements that last unlike long have each their own duration: τ_i = (n_i − 1)/(n − 1), n the
+    longest, in A, b and Ψ, as :class:`~zoo.movement.response.Transformation` has it. How long a
+    movement of which only frames are known will last is then not known: the latent path prior is a
+    mixture over durations of training movements too (:class:`~zoo.movement.paces.Paces`).
+    Movements end, and nothing is said of frames after the longest.
     N. Chen, M. Karl, P. van der Smagt, *Dynamic movement primitives in latent space of
     time-dependent variational autoencoders*, Humanoids 2016.
     """
 
     def forward(self, batch: Batch) -> None:
         """The Pyro program: both sub-sequence lengths, (80) and (81), observe the window (82)."""
-        windows, time = batch.values.shape[:2]
+        windows, time = self._windows(batch)
         latent = self.latent_dim
         unit = dist.Normal(self.basis.new_zeros(()), self.basis.new_ones(()), validate_args=False)
         rows = len(batch.movements)
@@ -71,6 +77,17 @@ class VaeDmp(LatentPathPrior, LatentChanges):
                     x = x.mask(batch.mask)
                 pyro.sample(name, x.to_event(2), obs=batch.given(batch.values))
 
+    def _windows(self, batch: Batch) -> tuple[int, int]:
+        """Number and length of the windows, none of which may be padded."""
+        windows, time = batch.values.shape[:2]
+        if batch.lengths is not None and time > int(batch.lengths.min()):
+            raise MovementLengthError(
+                f"{self.label} takes movements of unlike length in windows of one length; got "
+                f"windows of {time} frames and a movement of {int(batch.lengths.min())}: set "
+                f"window={int(batch.lengths.min())} or less"
+            )
+        return windows, time
+
     def plan(self, rows: int) -> Plan:
         """The sites of ``rows`` movements."""
         zero = self.basis.new_zeros(rows, self.latent_dim)
@@ -81,36 +98,55 @@ class VaeDmp(LatentPathPrior, LatentChanges):
             start=pyro.sample("start", unit) if self.goal_scaling else None,
         )
 
-    def noise_gain(self) -> Float[Tensor, "latent state"]:
+    def noise_gain(self, batch: Batch) -> Float[Tensor, "*window latent state"]:
         """G: ε = ε̂ w_ε enters the next state as (77) says."""
-        return (self.system.stiffness * self.w_noise) @ self.step_input
+        return (self.system.stiffness * self.w_noise) @ self._moves(batch)[1]
 
     def initial_state(
-        self, z: Float[Tensor, "window latent"], velocity: Float[Tensor, "window latent"]
+        self,
+        z: Float[Tensor, "window latent"],
+        velocity: Float[Tensor, "window latent"],
+        batch: Batch,
     ) -> Float[Tensor, "window state"]:
         """(z*_1, ż_1) of a window's first frame."""
-        return torch.cat([self.embed(z), self.config.velocity_scale * velocity], dim=1)
+        return torch.cat([self.embed(z), self._speed(velocity, batch)], dim=1)
+
+    def _speed(
+        self, velocity: Float[Tensor, "window latent"], batch: Batch
+    ) -> Float[Tensor, "window latent"]:
+        """ż_1 = σ_ż v / τ."""
+        speed, lengths = self.config.velocity_scale * velocity, self.lengths(batch)
+        if lengths is None:
+            return speed
+        return speed * ((self.frames - 1) / (windows_of(batch, lengths) - 1))[:, None].to(speed)
 
     def forces(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window latent"]:
         """αβ z^goal + f_t of every step, f_t = αβ Ψ(s_t) w, time-major."""
         steps = batch.values.shape[1] - 1
         goal = self.embed(plan.goal)
         w = self.scaled(plan.w, goal, None if plan.start is None else self.embed(plan.start))
-        pull = goal + self.forcing(w, plan)
+        pull = goal + self.forcing(w, plan, batch)
         at = batch.start + torch.arange(steps, device=batch.start.device)[:, None]
         row = at * pull.shape[1] + batch.sequence
         picked = (self.system.stiffness * pull).flatten(0, 1).index_select(0, row.flatten())
         return picked.view(steps, len(batch), -1)
 
     def forcing(
-        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
+        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan, batch: Batch
     ) -> Float[Tensor, "step sequence latent"]:
         """f_t in units of αβ of every step of whole movements, time-major."""
-        return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+        lengths = self.lengths(batch)
+        if lengths is None:
+            return torch.einsum("tk,ukl->tul", self.config.w_scale * self.basis, w)
+        each, which = lengths.unique(return_inverse=True)
+        steps = batch.movements.shape[1] - 1
+        Ψ = [self.kernels_at(steps, self.pace(n)).to(w) for n in each.tolist()]
+        return torch.einsum("utk,ukl->tul", self.config.w_scale * torch.stack(Ψ)[which], w)
 
     def drive(self, plan: Plan, batch: Batch) -> Float[Tensor, "step window state"]:
         """What goal and forcing term add to the state in every step, (77)."""
-        return self.forces(plan, batch) @ self.step_input
+        force, push = self.forces(plan, batch), self._moves(batch)[1]
+        return force @ push if push.ndim == 2 else torch.einsum("twd,wds->tws", force, push)
 
     def path(
         self,
@@ -121,11 +157,14 @@ class VaeDmp(LatentPathPrior, LatentChanges):
         batch: Batch,
     ) -> Float[Tensor, "window time latent"]:
         """z*_{1:T} by the linear response of (75): no loop over time."""
-        steps = batch.values.shape[1]
-        response = Response.of(self.system, steps, z.dtype, z.device)
+        steps, lengths = batch.values.shape[1], self.lengths(batch)
         noise = ε.transpose(0, 1) @ (self.system.stiffness * self.w_noise)
         force = self.forces(plan, batch) + noise
-        begin = torch.stack([self.embed(z), self.config.velocity_scale * velocity])
+        begin = torch.stack([self.embed(z), self._speed(velocity, batch)])
+        if lengths is not None:
+            each, which = windows_of(batch, lengths).unique(return_inverse=True)
+            return timed_paths([self.lasting(n) for n in each.tolist()], which, begin, force)
+        response = Response.of(self.system, steps, z.dtype, z.device)
         states = response.product(begin.flatten(1), force.flatten(1))
         return states[0].view(steps, len(batch), -1).transpose(0, 1)
 
@@ -158,7 +197,7 @@ class VaeDmp(LatentPathPrior, LatentChanges):
 
     def _recognised(self, batch: Batch, posterior: Posterior | None, draws: int) -> Tensor:
         """Draws of the paths of whole movements."""
-        check_whole(self.label, self.frames, batch.values.shape[1])
+        self._whole(batch)
         drawn = need(posterior).draw(batch, draws)
         flat = {name: value.flatten(0, 1) for name, value in drawn.items()}
         first, velocity, ε = flat["z"][:, 0], flat["velocity"], flat["epsilon"]

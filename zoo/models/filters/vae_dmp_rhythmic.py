@@ -21,6 +21,7 @@ from zoo.models.filters.cycles import CyclePrior
 from zoo.models.filters.latent_path_prior import PRIOR_DRAWS
 from zoo.models.filters.vae_dmp import VaeDmp
 from zoo.movement.demonstrations import extremes, seen_entries
+from zoo.movement.lengths import checked_span
 from zoo.movement.plan import Latents, Plan
 from zoo.movement.response import ALPHA_FRAME, Response, rhythmic_basis
 from zoo.movement.timing import period_of, tempos
@@ -69,8 +70,8 @@ class RhythmicVaeDmp(VaeDmp):
     condition a mixture over limit cycles, the weights and centres of the training movements, at
     every phase and at tempos like those found, with what their cycles leave as a stationary process
     (:class:`~zoo.models.filters.cycles.CyclePrior`). Another goal is another centre; another
-    duration stretches the period. Movements must have one common length; a forecast may start in
-    any phase, and go on for any time.
+    duration stretches the period. Movements may last unlike long; a forecast may start in any
+    phase, and go on for any time.
     """
 
     config_class: ClassVar[type] = Config
@@ -82,10 +83,12 @@ class RhythmicVaeDmp(VaeDmp):
     prior_timings: Tensor
 
     def __init__(self, layout: Layout, config: Config) -> None:
-        """A model of movements of ``layout.frames`` frames, all of one length."""
-        frames = layout.frames or 0
-        alpha = ALPHA_FRAME * max(frames - 1, 1) if config.alpha is None else config.alpha
-        super().__init__(layout, replace(config, alpha=alpha))
+        """A model of the movements of ``layout``, however long each of them lasts."""
+        shortest, frames = checked_span(self.label, layout)
+        alpha = ALPHA_FRAME * (frames - 1) if config.alpha is None else config.alpha
+        one_length = replace(layout, frames=frames, span=None)
+        super().__init__(one_length, replace(config, alpha=alpha))
+        self.shortest, self.is_ragged = shortest, shortest < frames
         period = self.frames - 1.0 if config.period is None else config.period * (layout.rate or 1)
         self.register_buffer("period", torch.tensor(period))
         self.register_buffer("prior_timings", torch.empty(0))
@@ -126,16 +129,26 @@ class RhythmicVaeDmp(VaeDmp):
             goal=pyro.sample("goal", unit.to_event(1)),
         )
 
+    def lengths(self, batch: Batch) -> None:
+        """None: all go by the clock of one period, however long they last."""
+
+    def pace(self, frames: int) -> float:
+        """1, of any movement."""
+        return 1.0
+
     def forcing(
-        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan
+        self, w: Float[Tensor, "sequence kernel latent"], plan: Plan, batch: Batch
     ) -> Float[Tensor, "step sequence latent"]:
         """f_t in units of αβ of every step of whole movements, time-major."""
         phase, tempo = timed(plan)
-        Ψ = self.config.w_scale * self.rhythm(phase, tempo, self.frames - 1)
+        Ψ = self.config.w_scale * self.rhythm(phase, tempo, batch.movements.shape[1] - 1)
         return torch.einsum("utk,ukl->tul", Ψ, w)
 
     def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
-        """Keep weights, centres and timings of the training movements, and what they leave."""
+        """Keep weights, centres and timings of the training movements, and what they leave.
+
+        What shorter ones leave is scaled, as the process is estimated per frame of the longest.
+        """
         self.reached = extremes(batch.values, seen_entries(batch))
         drawn = posterior.draw(batch, PRIOR_DRAWS)
         found = self._latents(drawn)
@@ -145,17 +158,19 @@ class RhythmicVaeDmp(VaeDmp):
         frames = self._observe(batch, posterior)
         seen, timings = self._frames_seen(batch), self.prior_timings.double()
         cycles = self._cycles(timings, self.frames) @ self.prior_movements.double()
-        residuals = (frames.double() - cycles) * seen[..., None]
+        share = (batch.frames / self.frames).double()[:, None, None]
+        residuals = (frames.double() - cycles) * seen[..., None] / share.sqrt()
         self.prior_residuals = residuals.to(frames).detach()
         self.prior_shape = frames.new_empty(0)
-        lengths = (self.frames // 7, self.frames // 3)
-        prior, readout = self._prior(self.frames, COARSE), self._readout(frames)
-        tuned = prior.tuned(cycles + residuals, lengths, readout, self.prior_without)
+        end, lengths = self.shortest, (self.shortest // 7, self.shortest // 3)
+        prior, readout = self._prior(end, COARSE), self._readout(frames[:, :end])
+        truth = cycles[:, :end] + ((frames - cycles) * seen[..., None])[:, :end]
+        tuned = prior.tuned(truth, lengths, readout, self.prior_without)
         self.prior_shape = frames.new_tensor(tuned.shape)
 
     def prior_without(self, row: int) -> CyclePrior:  # type: ignore[override]
         """The mixture over limit cycles of all training movements but one."""
-        return self._prior(self.frames, COARSE, torch.arange(len(self.prior_movements)) != row)
+        return self._prior(self.shortest, COARSE, torch.arange(len(self.prior_movements)) != row)
 
     def _prior(  # type: ignore[override]
         self, length: int, grid: tuple[int, int] = GRID, rows: Tensor | None = None
@@ -189,11 +204,12 @@ class RhythmicVaeDmp(VaeDmp):
         cycles: Tensor = states[before:].unflatten(1, force.shape[1:]).movedim(0, 1)
         return cycles
 
-    def _pull(self, found: Latents, duration: float) -> Float[Tensor, "sample sequence step d"]:
+    def _pull(
+        self, found: Latents, steps: int, τ: float
+    ) -> Float[Tensor, "sample sequence step d"]:
         """z^goal + σ_w Ψ w at every step: the forces in units of αβ."""
         phase, tempo = (v.flatten() for v in timed(found.plan))
-        steps = round((self.frames - 1) * duration)
-        Ψ = self.rhythm(phase, tempo, steps, duration=duration).unflatten(0, found.w.shape[:2])
+        Ψ = self.rhythm(phase, tempo, steps, duration=τ).unflatten(0, found.w.shape[:2])
         pull: Tensor = found.goal.unsqueeze(2) + self.config.w_scale * Ψ @ found.w
         return pull
 

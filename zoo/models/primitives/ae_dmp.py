@@ -13,14 +13,10 @@ from torch import Tensor, nn
 
 from zoo.contract.readiness import need
 from zoo.contract.settings import Count, Layers, Positive, Share, settings
-from zoo.errors import NotFittedError
-from zoo.models.primitives.imitator import Imitator
+from zoo.models.primitives.encoded_paths import EncodedPaths
 from zoo.movement.components import ramp
-from zoo.movement.demonstrations import extremes
 from zoo.movement.forcing import target_known
-from zoo.movement.lengths import check_end, check_whole, common_length
-from zoo.movement.paths import PathPrior, Readout
-from zoo.nn.metric import jacobians
+from zoo.movement.lengths import check_whole
 from zoo.nn.mlp import Activation, mlp, widths
 from zoo.prediction.predictive import Predictive
 from zoo.types import Batch, Layout, Posterior, Wishes
@@ -58,7 +54,7 @@ class Config:
     noise_floor: Positive = 1e-3
 
 
-class AeDmp(nn.Module):
+class AeDmp(EncodedPaths):
     r"""Movements that are one DMP each in the latent space of a denoising autoencoder.
 
     With the encoded path y = enc(x), the roll-out ỹ = R θ of θ = (y₁, ẏ₁, g, w), and β = α/4::
@@ -82,7 +78,9 @@ class AeDmp(nn.Module):
     movements on the frames observed (:class:`~zoo.movement.paths.PathPrior`), with draws; after
     training on a single movement it is as wide as that movement's own θ. Missing joints come from
     the chain of §5.3.4, frame by frame, and the primitive nearest to the path it finds, which the
-    thesis leaves out. Movements must have one common length.
+    thesis leaves out. Movements that last unlike long have each their own τ, R and Ψ (see
+    :class:`~zoo.models.primitives.imitator.Imitator`); forecasts then are a mixture over durations
+    of training movements as well.
     """
 
     config_class: ClassVar[type] = Config
@@ -90,27 +88,21 @@ class AeDmp(nn.Module):
     label: ClassVar[str] = "ae-dmp"
     phased: ClassVar[bool] = True
 
-    prior_movements: Tensor
-    prior_residuals: Tensor
-    prior_shape: Tensor
-    reached: Tensor
+    config: Config
 
     def __init__(self, layout: Layout, config: Config) -> None:
-        """A model of movements of ``layout.frames`` frames, all of one length."""
-        super().__init__()
+        """A model of the movements of ``layout``, the longest as the unit of time."""
+        super().__init__(layout, config.kernels, config.alpha)
         self.layout, self.config = layout, config
-        self.frames = common_length(self.label, layout)
-        self.latent_dim = config.latent_dim
-        self.imitator = Imitator(self.frames, config.kernels, config.alpha)
+        self.latent_dim, self.chain = config.latent_dim, config.chain
+        self.noise_floor = config.noise_floor
         sizes = [config.latent_dim, *widths(config.hidden)[::-1], len(layout.channels)]
         self.decoder = mlp(sizes, config.activation)
         self.root = nn.Parameter(torch.tensor(config.noise_std**0.5))
         self.settled = self.integrated = config.pretraining < 1
-        for name in ("prior_movements", "prior_residuals", "prior_shape", "reached"):
-            self.register_buffer(name, torch.empty(0))
 
     @property
-    def σ(self) -> Float[Tensor, ""]:
+    def σ(self) -> Float[Tensor, "*channel"]:
         """The one standard deviation of all channels."""
         return self.root.square() + self.config.noise_floor
 
@@ -122,7 +114,8 @@ class AeDmp(nn.Module):
 
     def forward(self, batch: Batch) -> None:
         """The generative program of whole movements: (72) as a log joint, or its first stage."""
-        windows, time = self._whole(batch).shape[:2]
+        (windows, time), lengths = batch.values.shape[:2], self._lengths(batch)
+        check_whole(self.label, batch.movements.shape[1], time)
         zero = batch.values.new_zeros(())
         prior = PRIORS[self.config.prior](zero, zero + self.config.prior_scale)
         weights = dist.Normal(zero, zero + 1.0)
@@ -130,13 +123,14 @@ class AeDmp(nn.Module):
         if self.config.weight_scale is not None:
             pyro.factor("weights", self._weight_prior(self.config.weight_scale))
         with pyro.plate("windows", size=batch.total, subsample=torch.arange(windows)):
-            y = pyro.sample("y", prior.expand([windows, time, self.latent_dim]).to_event(2))
+            y_t = prior.expand([windows, time, self.latent_dim]).mask(_inside(lengths, time))
+            y = pyro.sample("y", y_t.to_event(2))
             θ = pyro.sample("theta", weights.expand(θ_shape).to_event(2))
-            path = self.imitator.roll_out(θ) if self.integrated else y
+            path = self.imitator.roll_outs(θ, lengths, time) if self.integrated else y
             x = dist.Normal(self.decoder(path), self.σ).mask(_all(batch.mask))
             pyro.sample("x", x.to_event(2), obs=batch.given(batch.values))
             if self.integrated:
-                f, f_target = self.imitator.forces(y, θ)
+                f, f_target = self.imitator.all_forces(y, θ, lengths)
                 force = dist.Normal(f, self.σ / self.config.penalty**0.5)
                 if batch.mask is not None:
                     force = force.mask(target_known(batch.mask.any(-1))[..., None])
@@ -148,18 +142,27 @@ class AeDmp(nn.Module):
         return -torch.stack([w.square().sum() for w in weights]).sum() / (2 * scale**2)
 
     def imitate(
-        self, path: Float[Tensor, "window time latent"], seen: Bool[Tensor, "window time"] | None
+        self,
+        path: Float[Tensor, "window time latent"],
+        seen: Bool[Tensor, "window time"] | None,
+        batch: Batch | None = None,
     ) -> Float[Tensor, "window parameter latent"]:
-        """θ of the roll-outs nearest to ``path`` where it was observed."""
-        return self.imitator.fit(path, seen)
+        """θ of the roll-outs nearest to ``path`` where observed, as long as those of ``batch``."""
+        return self.imitator.fits(path, seen, None if batch is None else self._lengths(batch))
 
     def represent(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Roll-outs ỹ of the movements in the latent space, without their uncertainty."""
-        return Predictive(location=self.imitator.roll_out(self._imitated(batch, posterior))[None])
+        return Predictive(location=self._rolled(batch, posterior)[None])
 
     def reconstruct(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """The movements rolled out by the DMP and decoded, p(x̂ | θ)."""
-        return self.decode(self.imitator.roll_out(self._imitated(batch, posterior))[None])
+        return self.decode(self._rolled(batch, posterior)[None])
+
+    def _rolled(
+        self, batch: Batch, posterior: Posterior | None
+    ) -> Float[Tensor, "sequence time latent"]:
+        θ, frames = self._imitated(batch, posterior), self._whole(batch)
+        return self.imitator.roll_outs(θ, self._lengths(batch), frames)
 
     def impute(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """Missing joints by the chain of §5.3.4 and a DMP; missing frames given those seen."""
@@ -175,9 +178,10 @@ class AeDmp(nn.Module):
         mask: Bool[Tensor, "sequence time channel"] | None,
     ) -> Float[Tensor, "sequence time latent"]:
         """Roll-outs nearest to the paths of whole movements with missing joints."""
-        if mask is None or y.shape[1] != self.frames:
+        if mask is None or not (self.is_ragged or y.shape[1] == self.frames):
             return y
-        rolled = self.imitator.roll_out(self.imitator.fit(y))
+        own = self._lasting(y.shape[1])
+        rolled = own.roll_out(own.fit(y))
         return torch.where(mask.all(-1).all(-1)[:, None, None], y, rolled)
 
     def forecast(
@@ -197,86 +201,18 @@ class AeDmp(nn.Module):
         draws: int,
     ) -> Predictive:
         """Goal changes (§5.3.6, in latent space), other durations, and switching (89)."""
-        duration = wishes.duration
-        θ, length = self._imitated(batch, posterior), round((self.frames - 1) * duration) + 1
+        own, duration = self._lasting(self._whole(batch)), wishes.duration
+        θ, length = self._imitated(batch, posterior), round((own.frames - 1) * duration) + 1
         if wishes.goal is not None:
-            θ = self.imitator.aimed(θ, need(posterior).encode(wishes.goal).mean)
+            θ = own.aimed(θ, need(posterior).encode(wishes.goal).mean)
         if wishes.onto is None:
-            return self.decode((self.imitator.design(length, duration=duration).to(θ) @ θ)[None])
+            return self.decode((own.design(length, duration=duration).to(θ) @ θ)[None])
+        self._whole(wishes.onto)
         η = ramp(length, wishes.start, wishes.steps)
-        here = self.imitator.design(length, duration=duration, weight=1 - η)
-        there = self.imitator.design(length, duration=duration, weight=η, begin=False)
+        here = own.design(length, duration=duration, weight=1 - η)
+        there = own.design(length, duration=duration, weight=η, begin=False)
         path = here.to(θ) @ θ + there.to(θ) @ self._imitated(wishes.onto, posterior)
         return self.decode(path[None])
-
-    def learn_prior(self, batch: Batch, posterior: Posterior) -> None:
-        """Keep the θ of the training movements and what their roll-outs leave of the paths."""
-        mask = torch.ones_like(batch.values) > 0 if batch.mask is None else batch.mask
-        self.reached = extremes(batch.values, mask)
-        y, seen = self._encoded(batch, posterior)
-        self.prior_movements = self._imitated(batch, posterior)
-        rolled = self.imitator.roll_out(self.prior_movements)
-        self.prior_residuals = (y - rolled) * seen[..., None]
-        self.prior_shape = y.new_empty(0)
-        prior, window = self._prior(self.frames), (self.frames // 7, self.frames // 2)
-        tuned = prior.tuned(window, self._readout(y), self.prior_without)
-        self.prior_shape = y.new_tensor(tuned.shape)
-
-    def learn_noise(self, batch: Batch, posterior: Posterior) -> None:
-        """σ of movements that no network was trained on, never below what training found."""
-        y, _ = self._encoded(batch, posterior)
-        error = (self.decoder(y) - batch.values).square()
-        mean = error.mean() if batch.mask is None else (error * batch.mask).sum() / batch.mask.sum()
-        std = torch.maximum(mean.sqrt(), self.σ)
-        self.root.copy_((std - self.config.noise_floor).sqrt())
-
-    def prior_without(self, row: int) -> PathPrior:
-        """The mixture over latent paths of all training movements but one."""
-        return self._prior(self.frames, torch.arange(len(self.prior_movements)) != row)
-
-    def _readout(self, y: Float[Tensor, "sequence time latent"]) -> Readout:
-        J = jacobians(self.decoder, y.flatten(0, 1)).detach().double()
-        std = self.σ.detach().double().expand(J.shape[1])
-        return Readout(J.unflatten(0, y.shape[:2]), std)
-
-    def _prior(self, length: int, rows: Tensor | None = None) -> PathPrior:
-        """The mixture over latent paths of ``length`` frames, in float64, of some movements."""
-        if not self.prior_movements.numel():
-            raise NotFittedError(f"{self.label} knows no movements yet; train it by zoo.fit first")
-        kept = slice(None) if rows is None else rows
-        θ, residuals = self.prior_movements[kept].double(), self.prior_residuals[kept].double()
-        return self.imitator.prior(θ, residuals, length, self.prior_shape.tolist())
-
-    def _completed(
-        self,
-        y: Float[Tensor, "sequence time latent"],
-        seen: Bool[Tensor, "sequence time"],
-        length: int,
-        draws: int,
-    ) -> Float[Tensor, "sample sequence frame latent"]:
-        """Draws of paths of ``length`` frames given the latent frames observed."""
-        check_end(self.label, self.frames, y.shape[1], length - y.shape[1])
-        return self._prior(length).completed(y, seen, draws)
-
-    def _encoded(
-        self, batch: Batch, posterior: Posterior | None
-    ) -> tuple[Float[Tensor, "sequence time latent"], Bool[Tensor, "sequence time"]]:
-        """Latent frames, missing joints filled by passing them k times; frames observed at all."""
-        guide, x = need(posterior), batch.values
-        if batch.mask is None:
-            return guide.encode(x).mean, torch.ones_like(x[..., 0], dtype=torch.bool)
-        x = torch.where(batch.mask, x, 0.0)
-        for _ in range(self.config.chain):
-            x = torch.where(batch.mask, x, self.decoder(guide.encode(x).mean))
-        return guide.encode(x).mean, batch.mask.any(-1)
-
-    def _imitated(self, batch: Batch, posterior: Posterior | None) -> Tensor:
-        self._whole(batch)
-        return need(posterior).draw(batch, 1)["theta"][0]
-
-    def _whole(self, batch: Batch) -> Tensor:
-        check_whole(self.label, self.frames, batch.values.shape[1])
-        return batch.values
 
     def encode(self, batch: Batch, posterior: Posterior | None, *, draws: int) -> Predictive:
         """y_t = enc(x_t) of every frame, before the DMP; missing entries count as 0."""
@@ -285,6 +221,13 @@ class AeDmp(nn.Module):
     def decode(self, paths: Float[Tensor, "sample sequence time latent"]) -> Predictive:
         """p(x_t | y_t), independent of the frames beside."""
         return Predictive(location=self.decoder(paths), noise=self.σ, joint=True)
+
+
+def _inside(lengths: Tensor | None, time: int) -> Tensor | bool:
+    """Frames that are none of the padding."""
+    if lengths is None:
+        return True
+    return (torch.arange(time, device=lengths.device) < lengths[:, None])[..., None]
 
 
 def _all(mask: Tensor | None) -> Tensor | bool:

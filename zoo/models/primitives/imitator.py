@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -28,7 +28,8 @@ class Imitator:
 
     θ is in units of the prior N(0, I): latent positions for y₁ and g, 10 movement lengths for ẏ₁,
     and 3 for w, whose forces are in units of αβ. None for α is 25 a movement, or 0.4 a frame for
-    movements under 64 frames, whose Euler steps are unstable otherwise.
+    movements under 64 frames, whose Euler steps are unstable otherwise. Movements that last unlike
+    long share θ and α: time counts in durations, so that the τ of each is its number of frames.
 
     >>> imitator = Imitator(frames=70, kernels=20)
     >>> path = torch.linspace(0, 1, 70)[:, None].sin()
@@ -74,6 +75,71 @@ class Imitator:
         time = torch.arange(steps, dtype=torch.float64)
         whole = (self.frames - 1) * duration
         return discrete_basis(time, kernels=self.kernels, duration=whole)
+
+    def lasting(self, frames: int) -> Imitator:
+        """The same primitive, with the same α, for movements of ``frames`` frames."""
+        if frames == self.frames:
+            return self
+        return Imitator(frames, self.kernels, self.system.alpha)
+
+    def share(self, longest: int) -> float:
+        """τ beside movements of ``longest`` frames."""
+        return (self.frames - 1) / (longest - 1)
+
+    def fits(
+        self,
+        path: Float[Tensor, "window time latent"],
+        seen: Bool[Tensor, "window time"] | None,
+        lengths: Int[Tensor, " window"] | None,
+    ) -> Float[Tensor, "window parameter latent"]:
+        """θ of movements that last unlike long, padded to the longest; None: all are whole."""
+        if lengths is None:
+            return self.fit(path, seen)
+        parts = [
+            own.fit(path[rows, : own.frames], _observed(seen, rows, own.frames))
+            for own, rows in self._alike(lengths)
+        ]
+        return _ordered(parts, lengths)
+
+    def roll_outs(
+        self,
+        theta: Float[Tensor, "*sample window parameter latent"],
+        lengths: Int[Tensor, " window"] | None,
+        time: int,
+    ) -> Float[Tensor, "*sample window time latent"]:
+        """y = R θ of every movement, 0 after its end up to ``time`` frames."""
+        if lengths is None:
+            return self.roll_out(theta)
+        parts = [
+            pad(own.roll_out(theta[..., rows, :, :]), (0, 0, 0, time - own.frames))
+            for own, rows in self._alike(lengths)
+        ]
+        return _ordered(parts, lengths)
+
+    def all_forces(
+        self,
+        path: Float[Tensor, "*sample window time latent"],
+        theta: Float[Tensor, "*sample window parameter latent"],
+        lengths: Int[Tensor, " window"] | None,
+    ) -> tuple[
+        Float[Tensor, "*sample window step latent"], Float[Tensor, "*sample window step latent"]
+    ]:
+        """:meth:`forces` of every movement, 0 after its end."""
+        if lengths is None:
+            return self.forces(path, theta)
+        time = path.shape[-2]
+        parts = [
+            pad(torch.stack(own.forces(y[..., : own.frames, :], θ)), (0, 0, 0, time - own.frames))
+            for own, rows in self._alike(lengths)
+            for y, θ in [(path[..., rows, :, :], theta[..., rows, :, :])]
+        ]
+        force, target = _ordered(parts, lengths)
+        return force, target
+
+    def _alike(self, lengths: Int[Tensor, " window"]) -> Iterator[tuple[Imitator, Tensor]]:
+        """The primitive of every length, with the movements that have it."""
+        for n in lengths.unique().tolist():
+            yield self.lasting(n), (lengths == n).nonzero()[:, 0]
 
     def fit(
         self,
@@ -145,17 +211,29 @@ class Imitator:
         )
 
 
-@lru_cache(maxsize=16)
+def _observed(seen: Tensor | None, rows: Tensor, frames: int) -> Tensor | None:
+    """Which frames were seen; None where all were."""
+    some = None if seen is None else seen[rows, :frames]
+    return None if some is None or bool(some.all()) else some
+
+
+def _ordered(parts: list[Tensor], lengths: Int[Tensor, " window"]) -> Tensor:
+    """Parts of each length in turn, in the order of the movements."""
+    found = torch.cat(parts, dim=-3)
+    return found.index_select(found.ndim - 3, lengths.argsort(stable=True).argsort())
+
+
+@lru_cache(maxsize=256)
 def _design(imitator: Imitator) -> Tensor:
     return imitator.design()
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=256)
 def _forcing(imitator: Imitator) -> Tensor:
     return SCALES[3] * imitator.kernels_at(imitator.frames - 1)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=256)
 def _gain(imitator: Imitator) -> Tensor:
     design = imitator.design()
     gain: Tensor = torch.linalg.solve(design.mT @ design + RIDGE * _eye(design), design.mT)
