@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from itertools import groupby
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import Markdown
@@ -129,14 +130,18 @@ def _meanings(entry: Entry) -> Iterator[str]:
 
 
 def _type(kind: Any) -> str:
-    """The values that a setting takes, in words."""
-    words = kind.__name__ if isinstance(kind, type) else str(kind)
-    words = re.sub(r"(?:typing\.)?Literal\[([^]]*)\]", _choices, words)
-    return re.sub(r"^typing\.Optional\[(.*)\]$", r"\1 | None", words)
-
-
-def _choices(match: re.Match[str]) -> str:
-    return " | ".join(word.strip().strip("\"'") for word in match[1].split(","))
+    """A type in words: choices by their values, alternatives between bars, no bounds."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _type(parts[0])
+    if origin is Literal:
+        return " | ".join(str(choice) for choice in parts)
+    if origin in (Union, UnionType):
+        return " | ".join(_type(part) for part in parts)
+    if parts:
+        inside = ", ".join("..." if part is ... else _type(part) for part in parts)
+        return f"{getattr(origin, '__name__', origin)}[{inside}]"
+    return "None" if kind is type(None) else str(getattr(kind, "__name__", kind))
 
 
 def _blocks(text: str) -> Iterator[tuple[bool, str]]:
