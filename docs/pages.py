@@ -7,24 +7,24 @@ tables under ``build/docs`` that pages include. Every figure comes from a file i
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from docs.tables import RESULTS, stored, table, write_tables  # noqa: E402
 from zoo.catalogue import CATALOGUE  # noqa: E402
 from zoo.contract.registry import Entry  # noqa: E402
 from zoo.faces.cards import as_markdown, card  # noqa: E402
 
 __all__ = ["main", "model_page", "write_models", "write_results", "write_tables"]
 
-DOCS, RESULTS, TABLES = ROOT / "docs", ROOT / "results", ROOT / "build" / "docs"
+DOCS, TABLES = ROOT / "docs", ROOT / "build" / "docs"
 KIND = {
     "Exact": "closed form",
     "Svi": "stochastic variational inference",
@@ -110,14 +110,14 @@ def _figure(name: str, home: Path) -> str:
     """The figure of the result that is about this model and the fewest others."""
     about = []
     for file in sorted(RESULTS.glob("*.json")):
-        models = {c.get("model") for c in _stored(file).get("cards", ())}
+        models = {c.get("model") for c in stored(file).get("cards", ())}
         if name in models and file.with_suffix(".png").is_file():
             about.append((len(models), file))
     if not about:
         return ""
     file = min(about)[1]
     shutil.copy(file.with_suffix(".png"), home)
-    result = _stored(file)
+    result = stored(file)
     link = f"[{result['id']}](../results/{file.stem}.md)"
     return (
         f"![{result['title']}]({file.stem}.png)\n\n*{link}: {result['title']} "
@@ -130,7 +130,7 @@ def write_results(home: Path) -> None:
     rows, short = [], {}
     for page in sorted(RESULTS.glob("*.md"), key=lambda p: ("leaderboard" not in p.stem, p.stem)):
         result, text = (
-            _stored(page.with_suffix(".json")),
+            stored(page.with_suffix(".json")),
             page.read_text("utf-8").replace(" ± ", " ±\u00a0"),
         )
         picture = page.with_suffix(".png")
@@ -179,131 +179,12 @@ def write_notebooks(home: Path, *, execute: bool) -> None:
     (home / "SUMMARY.md").write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def write_tables(home: Path) -> None:
-    """The tables of figures that hand-written pages include."""
-    home.mkdir(parents=True, exist_ok=True)
-    chooser = _stored(RESULTS / "chooser.json")
-    walks = _stored(RESULTS / "leaderboard_walk-setup-2.json")
-    few = _stored(RESULTS / "calibration.json")
-    made = {
-        "takes": _takes(chooser),
-        "costs": _costs(chooser, walks),
-        "regressors": _regressors(_stored(RESULTS / "uci.json")),
-        "bands_walk": _bands(walks),
-        "few_groups": _few(few),
-    }
-    for name, text in made.items():
-        (home / f"{name}.md").write_text(text + "\n", "utf-8")
-
-
-def _takes(chooser: Any) -> str:
-    """What every entry of sequences takes: yes, or no."""
-    asked = ("unequal lengths", "missing entries", "a single movement", "beyond the last frame")
-    rows = [
-        (
-            _link(r["model"]),
-            *("–" if a not in r["refused"] else _word(r["refused"][a]) for a in asked),
-        )
-        for r in chooser["rows"]
-        if len(r["refused"]) > 1
-    ]
-    return table(("model", *asked), rows) + _from(chooser["command"])
-
-
-def _costs(chooser: Any, walks: Any) -> str:
-    """Training on walks and its error, processor time of one forecast."""
-    seconds = {row[0]: float(row[-1]) / 4 for row in walks["rows"]}
-    error = {row[0]: str(row[1]) for row in walks["rows"]}
-    rows = []
-    for found in chooser["rows"]:
-        name, time = found["model"], found["milliseconds"].get("forecast")
-        if time is not None:
-            trained = f"{seconds[name]:.3g}" if name in seconds else ""
-            bands = "yes" if found["bands"]["forecast"] else "no"
-            rows.append((_link(name), trained, error.get(name, ""), f"{time:.0f}", bands))
-    titles = ("model", "training / s", "MSE / deg²", "one forecast / ms", "bands")
-    return table(titles, rows) + _from(
-        f"{walks['command']}`, a quarter of its four folds, and `{chooser['command']}"
-    )
-
-
-def _regressors(uci: Any) -> str:
-    """Errors and times of the regressors on public tables."""
-    rows = [
-        (data, f"`{name}`", *(f"{_mean(found[key]):.3g}" for key in ("rmse", "nll")),
-         f"{100 * _mean(found['coverage_90']):.0f} %", f"{found['seconds_a_fit']:.2g}")
-        for data, models in uci["measured"].items()
-        for name, found in models.items()
-    ]  # fmt: skip
-    titles = ("data", "entry", "RMSE", "NLL / nats", "90 % band holds", "one fit / s")
-    return table(titles, rows) + _from("python -m benchmarks.uci")
-
-
-def _bands(walks: Any) -> str:
-    """Coverage and width of the 90 % bands on walks held out."""
-    part = walks["sections"][0]
-    wanted = [0, 3, 4, 5, 7, 8]
-    rows = [[_cell(row[i]) for i in wanted] for row in part["rows"]]
-    return table([part["columns"][i] for i in wanted], rows) + _from(walks["command"])
-
-
-def _few(few: Any) -> str:
-    """What calibrated bands hold, by the number of walks to calibrate on."""
-    rows = [
-        (r["walks"], *(f"{r[k]['mean']:.1f} ± {r[k]['sd']:.1f} %" for k in ("50 %", "90 %")),
-         f"{r['width of 90 %']['mean']:.2f} ± {r['width of 90 %']['sd']:.2f}")
-        for r in few["rows"]
-        if r["recalibration"] == "conformal" and r["by"] != "one factor"
-    ]  # fmt: skip
-    titles = ("walks to calibrate on", "50 % band holds", "90 % band holds", "width ÷ raw")
-    said = "; ± is the standard deviation over repetitions"
-    return table(titles, rows) + _from("python -m benchmarks.calibration", said)
-
-
-def table(titles: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table; bars inside of cells stay what they are.
-
-    >>> print(table(("a", "b"), [("|x|", 1)]))
-    | a | b |
-    |---|---|
-    | &#124;x&#124; | 1 |
-    """
-    head, *body = (
-        " | ".join(str(cell).replace("|", "&#124;") for cell in line) for line in (titles, *rows)
-    )
-    return "\n".join([f"| {head} |", "|" + "---|" * len(titles), *(f"| {line} |" for line in body)])
-
-
-def _from(command: str, said: str = "") -> str:
-    return f"\n\n*From `{command}`{said}.*"
-
-
-def _word(refusal: str) -> str:
-    return "no" if refusal else "yes"
-
-
-def _link(name: str) -> str:
-    return f"[`{name}`](models/{name}.md)" if name in CATALOGUE.names() else f"`{name}`"
-
-
-def _cell(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def _mean(value: Any) -> float:
-    return float(value["mean"])
-
-
 def _kind(entry: Entry) -> str:
     return KIND[type(entry.inference).__name__]
 
 
 def _title(page: Path) -> str:
     return page.read_text("utf-8").splitlines()[0].removeprefix("# ")
-
-
-def _stored(file: Path) -> Any:
-    return json.loads(file.read_text("utf-8"))
 
 
 def _short(name: str, title: str) -> str:

@@ -124,6 +124,7 @@ def test_a_setup_that_means_nothing_is_refused(settings: dict[str, Any], reason:
         zoo.Setup(**settings)
 
 
+@pytest.mark.filterwarnings("ignore::zoo.errors.OtherQuestionWarning")
 def test_evaluation_and_calibration_are_told_what_will_be_missing() -> None:
     """Scored entries are those named; bands of a channel are mended by its own errors."""
     setup = zoo.Setup(hidden=("joint_3",), section=(8, 12), draws=20)
