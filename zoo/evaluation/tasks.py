@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from torch import Tensor
 
@@ -23,6 +23,8 @@ __all__ = [
     "posed",
     "tasks_of",
 ]
+
+T = TypeVar("T")
 
 
 class Predictor(Protocol):
@@ -113,21 +115,33 @@ def posed(
 ) -> tuple[list[Outcome], dict[str, str]]:
     """The answers to every task that the model can do, or to those named, and why others have none.
 
-    Where no task has an answer the first one's UnanswerableError is raised.
+    All questions are posed before any is answered: a setup that one of them cannot have is refused
+    at once. Where no task has an answer the first one's UnanswerableError is raised.
     """
-    found: list[Outcome] = []
-    refused: dict[str, UnanswerableError] = {}
     how = Setup() if setup is None else setup
     if not isinstance(how, Setup):
         raise TypeError(f"setup must be a zoo.Setup; got {type(how).__name__}")
-    for name in tasks_of(run, tasks):
+    names = tasks_of(run, tasks)
+    questions, refused = _taken(names, lambda name: ask(name, data, how))
+    found, unanswered = _taken(questions, lambda name: _outcome(run, questions[name], how))
+    refused |= unanswered
+    why = {name: refused[name] for name in names if name in refused}
+    if why and not found:
+        raise next(iter(why.values()))
+    return list(found.values()), {name: str(error) for name, error in why.items()}
+
+
+def _taken(
+    names: Iterable[str], found: Callable[[str], T]
+) -> tuple[dict[str, T], dict[str, UnanswerableError]]:
+    """What is found for every name, and the errors of names for which there is no answer."""
+    taken, refused = dict[str, T](), dict[str, UnanswerableError]()
+    for name in names:
         try:
-            found.append(_outcome(run, ask(name, data, how), how))
+            taken[name] = found(name)
         except UnanswerableError as error:
             refused[name] = error
-    if refused and not found:
-        raise next(iter(refused.values()))
-    return found, {name: str(error) for name, error in refused.items()}
+    return taken, refused
 
 
 def tasks_of(run: Predictor, tasks: Sequence[str] | None = None) -> list[str]:
